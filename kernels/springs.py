@@ -1,0 +1,130 @@
+"""The spring law, and its forces over flat arrays of springs.
+
+Springs are stored as spans: ``(i, j, count, class)`` stands for the springs (i, j), (i + 1, j + 1), ... of one class.
+In a lattice in scan order spans are long; a single spring is a span of one. A span costs the 16 bytes of a spring.
+A class is ``(rest length [m], stiffness [N/m], damping [N s/m])``.
+"""
+
+from typing import Any
+
+import warp as wp
+
+from . import vectors
+
+wp.set_module_options({"enable_backward": False})
+
+# Longest span. It sizes the buffers on the stack of the CPU kernel and the lanes per span on a GPU.
+MAX_SPAN = 64
+
+
+@wp.func
+def spring_force(offset: Any, velocity: Any, rest: Any, stiffness: Any, damping: Any):
+    """Return the force on the first end; offset and velocity are those of the second end relative to the first."""
+    length = wp.length(offset)
+    force = type(rest)(0.0) * offset
+    # Ends that coincide for a moment have no direction, hence no force.
+    if length > type(rest)(0.0):
+        direction = offset / length
+        force = (stiffness * (length - rest) + damping * wp.dot(velocity, direction)) * direction
+    return force
+
+
+@wp.func
+def spring_energy(offset: Any, rest: Any, stiffness: Any):
+    """Return the elastic energy, whose negative gradient is the undamped force."""
+    stretch = wp.length(offset) - rest
+    return type(rest)(0.5) * stiffness * stretch * stretch
+
+
+@wp.kernel
+def add_spring_forces(
+    # Model:
+    spans: wp.array(dtype=wp.vec4i),
+    classes: wp.array(dtype=Any),
+    # State in:
+    x: wp.array2d(dtype=Any),
+    v: wp.array2d(dtype=Any),
+    # State out:
+    f: wp.array2d(dtype=Any),
+):
+    """Add the forces of the springs, one thread per spring; launched over (span, lane)."""
+    index, lane = wp.tid()
+    span = spans[index]
+    if lane >= span[2]:
+        return
+    i = span[0] + lane
+    j = span[1] + lane
+    c = classes[span[3]]
+    offset = vectors.load(x, j) - vectors.load(x, i)
+    velocity = vectors.load(v, j) - vectors.load(v, i)
+    force = spring_force(offset, velocity, c[0], c[1], c[2])
+    vectors.add(f, i, force)
+    vectors.add(f, j, -force)
+
+
+# The same law for a whole span on the CPU, in three passes that the compiler turns into vector instructions. It could
+# not do so in one pass, where the two ends may overlap. Within a pass no particle occurs twice, so plain adds do.
+@wp.func_native(f"""
+    auto law_rest = rest;
+    typedef decltype(law_rest) real;
+    const real* __restrict px = x.data + i;
+    const real* __restrict py = px + x.shape[1];
+    const real* __restrict pz = py + x.shape[1];
+    const real* __restrict qx = x.data + j;
+    const real* __restrict qy = qx + x.shape[1];
+    const real* __restrict qz = qy + x.shape[1];
+    const real* __restrict pu = v.data + i;
+    const real* __restrict pv = pu + v.shape[1];
+    const real* __restrict pw = pv + v.shape[1];
+    const real* __restrict qu = v.data + j;
+    const real* __restrict qv = qu + v.shape[1];
+    const real* __restrict qw = qv + v.shape[1];
+    real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}];
+    for (int s = 0; s < count; ++s) {{
+        real dx = qx[s] - px[s], dy = qy[s] - py[s], dz = qz[s] - pz[s];
+        real du = qu[s] - pu[s], dv = qv[s] - pv[s], dw = qw[s] - pw[s];
+        real square = dx * dx + dy * dy + dz * dz;
+        real inverse = square > real(0) ? real(1) / __builtin_elementwise_sqrt(square) : real(0);
+        real approach = (du * dx + dv * dy + dw * dz) * inverse;
+        real scale = stiffness * (real(1) - rest * inverse) + damping * approach * inverse;
+        gx[s] = scale * dx;
+        gy[s] = scale * dy;
+        gz[s] = scale * dz;
+    }}
+    real* __restrict fx = f.data + i;
+    real* __restrict fy = fx + f.shape[1];
+    real* __restrict fz = fy + f.shape[1];
+    for (int s = 0; s < count; ++s) {{ fx[s] += gx[s]; fy[s] += gy[s]; fz[s] += gz[s]; }}
+    fx += j - i;
+    fy += j - i;
+    fz += j - i;
+    for (int s = 0; s < count; ++s) {{ fx[s] -= gx[s]; fy[s] -= gy[s]; fz[s] -= gz[s]; }}
+""")
+def _add_span(
+    x: wp.array2d(dtype=Any),
+    v: wp.array2d(dtype=Any),
+    f: wp.array2d(dtype=Any),
+    i: int,
+    j: int,
+    count: int,
+    rest: Any,
+    stiffness: Any,
+    damping: Any,
+): ...
+
+
+@wp.kernel
+def add_span_forces(
+    # Model:
+    spans: wp.array(dtype=wp.vec4i),
+    classes: wp.array(dtype=Any),
+    # State in:
+    x: wp.array2d(dtype=Any),
+    v: wp.array2d(dtype=Any),
+    # State out:
+    f: wp.array2d(dtype=Any),
+):
+    """Add the forces of the springs, one thread per span; for the CPU, where spans run one after another."""
+    span = spans[wp.tid()]
+    c = classes[span[3]]
+    _add_span(x, v, f, span[0], span[1], span[2], c[0], c[1], c[2])

@@ -1,0 +1,95 @@
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from manifold3d import Manifold, Mesh64
+
+MODELS = Path(__file__).parents[1] / "scenes" / "models"
+EXTENTS = {
+    "tree": ([-1 / 3, 0.0, -1 / 3], [1 / 3, 1.0, 1 / 3]),
+    "coupler": ([-0.25, -0.3, -0.25], [0.25, 0.3, 0.25]),
+}
+
+
+def load(name: str) -> trimesh.Trimesh:
+    """Read a model as it is written, without merging or repair."""
+    return trimesh.load_mesh(MODELS / f"{name}.obj", process=False)
+
+
+def winding_numbers(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
+    """Return 1 inside and 0 outside: the signed solid angle of all triangles over 4 pi.
+
+    tan(angle / 2) = a . (b x c) / (|a||b||c| + a.b |c| + b.c |a| + c.a |b|), Van Oosterom and Strackee 1983.
+    """
+    a, b, c = np.moveaxis(mesh.triangles - points[:, None, None], 2, 0)
+    la, lb, lc = (np.linalg.norm(v, axis=-1) for v in (a, b, c))
+    ab, bc, ca = (np.einsum("...i,...i", u, v) for u, v in ((a, b), (b, c), (c, a)))
+    triple = np.einsum("...i,...i", a, np.cross(b, c))
+    return np.arctan2(triple, la * lb * lc + ab * lc + bc * la + ca * lb).sum(axis=-1) / (2 * np.pi)
+
+
+def test_models_are_what_the_script_makes(tmp_path: Path) -> None:
+    """Make the committed models again, byte for byte."""
+    runpy.run_path(str(MODELS / "make_models.py"))["write_models"](tmp_path)
+    assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
+        path.name: path.read_bytes() for path in MODELS.glob("*.obj")
+    }
+
+
+@pytest.mark.parametrize("name", EXTENTS)
+def test_model_is_one_closed_solid(name: str) -> None:
+    """Find each model closed, outward-oriented and in one piece."""
+    mesh = load(name)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert mesh.volume > 0
+    assert mesh.area_faces.min() > 0
+    solid = Manifold(Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
+    assert len(solid.decompose()) == 1
+
+
+@pytest.mark.parametrize("name", EXTENTS)
+def test_model_has_its_size(name: str) -> None:
+    """Find each model as large as its scenes expect."""
+    # The files keep six decimals.
+    np.testing.assert_allclose(load(name).bounds, EXTENTS[name], rtol=0, atol=5e-7)
+
+
+@pytest.mark.parametrize(
+    ("point", "inside"),
+    [
+        pytest.param([0.0, -0.29, 0.0], 0, id="bore, lower end"),
+        pytest.param([0.0, 0.0, 0.0], 0, id="bore, middle"),
+        pytest.param([0.0, 0.29, 0.0], 0, id="bore, upper end"),
+        pytest.param([0.19, -0.27, 0.0], 1, id="lower hub"),
+        pytest.param([0.0, 0.27, 0.19], 1, id="upper hub"),
+        pytest.param([0.0, 0.0, -0.19], 0, id="slit"),
+        pytest.param([0.0, 0.0, 0.19], 1, id="beam"),
+    ],
+)
+def test_coupler_is_bored_and_slit(point: list[float], inside: int) -> None:
+    """Find the coupler's bore and slit open and its wall solid."""
+    # A winding number is an integer: the tolerance covers the rounding of 2316 arctangents.
+    (winding,) = winding_numbers(load("coupler"), np.array([point]))
+    assert winding == pytest.approx(inside, abs=1e-9)
+
+
+def test_tree_faces_lie_on_cell_boundaries() -> None:
+    """Find every vertex of the tree on a corner of the 12-cell grid centred on it."""
+    cells = load("tree").vertices * 12
+    # The files keep six decimals: half of the last one, times 12.
+    np.testing.assert_allclose(cells, np.round(cells), rtol=0, atol=6e-6)
+
+
+def test_coupler_survives_20_cells() -> None:
+    """Keep two cells or more in every beam and every gap of each column of the wall."""
+    centers = (np.arange(20) + 0.5) * 0.03 - 0.3
+    mesh = load("coupler")
+    columns = [(x, z) for x in centers for z in centers if 0.14 < np.hypot(x, z) < 0.24]
+    for x, z in columns:
+        inside = winding_numbers(mesh, np.array([(x, y, z) for y in centers])) > 0.5
+        runs = np.diff(np.flatnonzero(np.diff(inside)), prepend=-1, append=len(inside) - 1)
+        assert runs.min() >= 2
+        assert len(runs) >= 5, "the slit winds at least twice around the axis"

@@ -1,0 +1,27 @@
+"""What can go wrong, and the exit code of the command line that goes with it."""
+
+from __future__ import annotations
+
+
+class WarpjellyError(Exception):
+    """Base of every error that warpjelly raises on purpose; the message is one line for people."""
+
+    exit_code = 4
+
+
+class InputError(WarpjellyError):
+    """The user's input is wrong: scene, model, arguments, a missing extra, output that exists."""
+
+    exit_code = 2
+
+
+class DivergedError(WarpjellyError):
+    """The simulation left the finite numbers; what was simulated before is kept."""
+
+    exit_code = 3
+
+
+class EnvironmentFailedError(WarpjellyError):
+    """The machine said no: a full disk, a missing permission, a lost device."""
+
+    exit_code = 4

@@ -1,0 +1,254 @@
+"""Occupancy grid -> particles, springs and surface of one body, in NumPy.
+
+Cubes that share a face share that face's particles; cubes that only touch along an edge or in a corner stay apart. One
+rule does it: every corner of every occupied unit cell belongs to a particle, and at a grid vertex the cells that are
+connected through faces around it share one. Which cells those are depends on the occupancy of the 8 cells alone, so a
+table of 256 entries gives the particle of every corner, without a search.
+
+Axes of all arrays are [x, y, z]; particles are in scan order, z fastest, so that neighbours in memory are neighbours in
+space and springs come in long runs.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+# Kinds of spring classes, in order: rest lengths 1, sqrt(2), sqrt(3) and 2 unit cells.
+STRUCTURAL, FACE_SHEAR, BODY_SHEAR, BEND = range(4)
+REST_LENGTHS = np.sqrt([1.0, 2.0, 3.0, 4.0])
+
+# The 13 directions of springs within a unit cell: one of each opposite pair, by kind.
+DIRECTIONS = [(dx, dy, dz) for dx in (-1, 0, 1) for dy in (-1, 0, 1) for dz in (-1, 0, 1) if (dx, dy, dz) > (0, 0, 0)]
+# Corners of a cell as (x, y, z) bits; a corner's number is 4 x + 2 y + z. Cells around a vertex are numbered alike.
+CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+
+
+@dataclass(frozen=True)
+class Lattice:
+    """One body at rest, in the frame of its grid."""
+
+    particles: np.ndarray
+    """Rest positions, float64 [particle_count, 3], m."""
+    springs: np.ndarray
+    """Both ends, int32 [spring_count, 2], class by class."""
+    spring_kinds: np.ndarray
+    """STRUCTURAL, FACE_SHEAR, BODY_SHEAR or BEND, uint8 [spring_count]."""
+    cell_counts: np.ndarray
+    """How many occupied unit cells share each particle, 1 to 8, int32 [particle_count]."""
+    unit: float
+    """Edge of a unit cell, m."""
+    voxel_count: int
+    """Number of jelly cubes."""
+    surface_particles: np.ndarray
+    """Particles on the surface, ascending, int32 [point_count]."""
+    surface_quads: np.ndarray
+    """Outward faces, counter-clockwise from outside, indices into surface_particles, int32 [face_count, 4]."""
+
+
+def build_lattice(cells: np.ndarray, *, origin: np.ndarray, cell_size: float, particles_per_edge: int = 2) -> Lattice:
+    """Join the occupied cells of a grid into one lattice.
+
+    Args:
+        cells: occupied jelly cubes, bool [nx, ny, nz]; at least one.
+        origin: lowest corner of the grid, [3], m.
+        cell_size: edge of a jelly cube, m.
+        particles_per_edge: particles along an edge of each jelly cube, at least 2.
+    """
+    refinement = particles_per_edge - 1
+    units = cells
+    for axis in range(3):
+        units = np.repeat(units, refinement, axis=axis)
+    unit = cell_size / refinement
+    corner_particles, particles, cell_counts = _share_corners(units)
+    springs, kinds = _connect(units, corner_particles, len(particles))
+    surface_particles, surface_quads = _skin(units, corner_particles, len(particles))
+    return Lattice(
+        particles=np.asarray(origin, float) + unit * particles,
+        springs=springs,
+        spring_kinds=kinds,
+        cell_counts=cell_counts,
+        unit=unit,
+        voxel_count=int(np.count_nonzero(cells)),
+        surface_particles=surface_particles,
+        surface_quads=surface_quads,
+    )
+
+
+def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[int, int]:
+    """Count what ``build_lattice`` would make without making it, from the corners, edges and faces of the jelly cubes.
+
+    Args:
+        cells: occupied jelly cubes, bool [nx, ny, nz].
+        particles_per_edge: particles along an edge of each jelly cube, at least 2.
+
+    Returns:
+        The number of particles, exact, and an upper bound of the number of springs, close for thick bodies.
+    """
+    cubes = int(np.count_nonzero(cells))
+    vertices = int(corner_labels()[1][_vertex_patterns(cells)].sum(dtype=np.int64))
+    faces = edges = 0
+    for axis in range(3):
+        across = np.moveaxis(cells, axis, -1)
+        faces += 2 * cubes - int(np.count_nonzero(across[..., 1:] & across[..., :-1]))
+        around = np.pad(across, [(1, 1), (1, 1), (0, 0)])
+        a, b, c, d = around[:-1, :-1], around[:-1, 1:], around[1:, :-1], around[1:, 1:]
+        # An edge between two cubes that only touch there is two edges.
+        edges += int(np.count_nonzero(a | b | c | d))
+        edges += int(np.count_nonzero((a & d & ~b & ~c) | (b & c & ~a & ~d)))
+    n = particles_per_edge - 1
+    particles = vertices + edges * (n - 1) + faces * (n - 1) ** 2 + cubes * (n - 1) ** 3
+    unit_edges = edges * n + faces * 2 * n * (n - 1) + cubes * 3 * n * (n - 1) ** 2
+    unit_faces = faces * n**2 + cubes * 3 * n**2 * (n - 1)
+    # Bend springs join consecutive structural ones, so there are fewer of them.
+    return particles, 2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3
+
+
+@functools.cache
+def corner_labels() -> tuple[np.ndarray, np.ndarray]:
+    """Say which cells around a grid vertex share a particle, for each of the 256 patterns of occupied cells.
+
+    Bit ``4 x + 2 y + z`` of a pattern stands for the cell on the (x, y, z) side of the vertex.
+
+    Returns:
+        labels: uint8 [256, 8], the particle of each cell, numbered from 0 in the order of the cells; 255 where empty.
+        counts: uint8 [256], the number of particles.
+    """
+    labels = np.full((256, 8), 255, np.uint8)
+    counts = np.zeros(256, np.uint8)
+    for pattern in range(256):
+        for start in range(8):
+            if not pattern >> start & 1 or labels[pattern, start] != 255:
+                continue
+            front = [start]
+            while front:
+                cell = front.pop()
+                labels[pattern, cell] = counts[pattern]
+                # Cells share a face around the vertex when their numbers differ in one bit.
+                front += [n for n in (cell ^ 1, cell ^ 2, cell ^ 4) if pattern >> n & 1 and labels[pattern, n] == 255]
+            counts[pattern] += 1
+    return labels, counts
+
+
+def _vertex_patterns(units: np.ndarray) -> np.ndarray:
+    """Return the pattern of occupied cells around each grid vertex, uint8 [nx + 1, ny + 1, nz + 1]."""
+    nx, ny, nz = units.shape
+    padded = np.pad(units, 1)
+    pattern = np.zeros((nx + 1, ny + 1, nz + 1), np.uint8)
+    for number, (x, y, z) in enumerate(CORNERS):
+        pattern |= padded[x : x + nx + 1, y : y + ny + 1, z : z + nz + 1].astype(np.uint8) << np.uint8(number)
+    return pattern
+
+
+def _share_corners(units: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Number the particles.
+
+    Returns:
+        The particle of each corner of each unit cell, int32 [8, nx, ny, nz], -1 in empty cells; the grid coordinates of
+        each particle, int32 [particle_count, 3]; the number of cells that share it, int32 [particle_count].
+    """
+    nx, ny, nz = units.shape
+    labels, counts = corner_labels()
+    pattern = _vertex_patterns(units)
+    count_at = counts[pattern]
+    first = np.cumsum(count_at, dtype=np.int32).reshape(count_at.shape) - count_at.astype(np.int32)
+    vertices = np.argwhere(count_at > 0).astype(np.int32)
+    particles = np.repeat(vertices, count_at[count_at > 0], axis=0)
+
+    corner_particles = np.full((8, nx, ny, nz), -1, np.int32)
+    for number, (x, y, z) in enumerate(CORNERS):
+        at = (slice(x, x + nx), slice(y, y + ny), slice(z, z + nz))
+        # The cell that has the vertex at its corner (x, y, z) lies on the opposite side of it.
+        label = labels[pattern[at], 7 - number]
+        corner_particles[number] = np.where(units, first[at] + label, -1)
+    cell_counts = np.bincount(corner_particles[corner_particles >= 0], minlength=len(particles)).astype(np.int32)
+    return corner_particles, particles, cell_counts
+
+
+def _connect(units: np.ndarray, corner_particles: np.ndarray, particle_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the springs, int32 [spring_count, 2], and their kinds, uint8 [spring_count]."""
+    springs: list[list[np.ndarray]] = [[], [], [], []]
+    for direction in DIRECTIONS:
+        kind = int(np.abs(direction).sum()) - 1
+        found = _springs_along(direction, units.shape, corner_particles)
+        springs[kind].append(found)
+        if kind == STRUCTURAL:
+            springs[BEND].append(_bend_springs(found, particle_count))
+    by_kind = [np.concatenate(parts) for parts in springs]
+    kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in by_kind])
+    return np.concatenate(by_kind), kinds
+
+
+def _springs_along(direction: tuple[int, int, int], shape: tuple[int, ...], corner_particles: np.ndarray) -> np.ndarray:
+    """Return the springs in one direction, int32 [count, 2], in scan order of the vertices they start from.
+
+    Up to four cells hold a spring's place, and each names its own pair of particles: mostly the same one.
+    """
+    nx, ny, nz = shape
+    candidates: list[tuple[Any, np.ndarray, np.ndarray]] = []
+    for number, corner in enumerate(CORNERS):
+        target = (corner[0] + direction[0], corner[1] + direction[1], corner[2] + direction[2])
+        if target in CORNERS:
+            at = tuple(slice(c, c + n) for c, n in zip(corner, shape, strict=True))
+            candidates.append((at, corner_particles[number], corner_particles[CORNERS.index(target)]))
+    pairs = np.full((nx + 1, ny + 1, nz + 1, len(candidates), 2), -1, np.int32)
+    for slot, (at, start, end) in enumerate(candidates):
+        repeated = np.zeros(shape, bool)
+        for earlier in range(slot):
+            repeated |= (pairs[(*at, earlier, 0)] == start) & (pairs[(*at, earlier, 1)] == end)
+        pairs[(*at, slot, 0)] = np.where(repeated, -1, start)
+        pairs[(*at, slot, 1)] = np.where(repeated, -1, end)
+    flat = pairs.reshape(-1, 2)
+    return flat[flat[:, 0] >= 0]
+
+
+def _bend_springs(structural: np.ndarray, particle_count: int) -> np.ndarray:
+    """Join consecutive structural springs along one axis, int32 [count, 2].
+
+    A particle has at most two springs towards one side: where cells that meet in it only along an edge part.
+    """
+    first, second = structural.T
+    following = np.full((particle_count, 2), -1, np.int32)
+    # Written in reverse, the earlier of two springs wins the first column; the other one goes to the second.
+    following[first[::-1], 0] = second[::-1]
+    other = following[first, 0] != second
+    following[first[other], 1] = second[other]
+
+    pairs = np.full((particle_count, 4, 2), -1, np.int32)
+    start = np.arange(particle_count, dtype=np.int32)
+    for slot in range(4):
+        middle = following[:, slot // 2]
+        end = np.where(middle >= 0, following[middle, slot % 2], -1)
+        fresh = (end >= 0) & (end[:, None] != pairs[:, :slot, 1]).all(axis=1)
+        pairs[fresh, slot, 0] = start[fresh]
+        pairs[fresh, slot, 1] = end[fresh]
+    flat = pairs.reshape(-1, 2)
+    return flat[flat[:, 0] >= 0]
+
+
+def _skin(units: np.ndarray, corner_particles: np.ndarray, particle_count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return the surface particles, int32 [point_count], and the outward quads over them, int32 [face_count, 4]."""
+    padded = np.pad(units, 1)
+    faces = []
+    for axis in range(3):
+        # The other two axes, in the order that makes their cross product point along +axis.
+        u, w = (axis + 1) % 3, (axis + 2) % 3
+        for side in (0, 1):
+            beyond = [slice(1, -1)] * 3
+            beyond[axis] = slice(2, None) if side else slice(0, -2)
+            exposed = units & ~padded[tuple(beyond)]
+            around = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]
+            corners = []
+            for along_u, along_w in around:
+                bits = [0, 0, 0]
+                bits[axis], bits[u], bits[w] = side, along_u, along_w
+                corners.append(corner_particles[CORNERS.index((bits[0], bits[1], bits[2]))][exposed])
+            faces.append(np.stack(corners, axis=1))
+    quads = np.concatenate(faces)
+    on_surface = np.zeros(particle_count, bool)
+    on_surface[quads] = True
+    point = np.cumsum(on_surface, dtype=np.int32) - np.int32(1)
+    return np.flatnonzero(on_surface).astype(np.int32), point[quads].astype(np.int32)

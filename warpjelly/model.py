@@ -1,0 +1,268 @@
+"""Model (constant arrays) and State (x, v, f): a scene on a device."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpjelly.kernels import contacts, springs
+
+from .lattice import REST_LENGTHS, Lattice, build_lattice
+from .plan import BodyPlan, Plan
+from .scene import AnyCollider, BoxCollider, Material, PlaneCollider, Scene, SphereCollider
+
+# Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
+CHUNK_SIZE = 256
+# Collider volumes are grown by this share of 1 m plus their distance from the origin, for the reason in bounds.MARGIN.
+VOLUME_MARGIN = 1e-5
+
+PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
+
+
+@dataclass(frozen=True)
+class Body:
+    """Where one body is in the arrays of the model."""
+
+    name: str
+    particles: slice
+    points: slice
+    """Its part of surface_particles."""
+    quads: np.ndarray
+    """Outward faces, indices into the body's points, int32 [face_count, 4]."""
+    unit: float
+    """Edge of a unit cell, m."""
+
+
+@dataclass(frozen=True)
+class Model:
+    """What stays the same over a run. Arrays are on the device; real is float32 or float64."""
+
+    bodies: list[Body]
+    real: type
+    voxel_count: int
+    particle_count: int
+    spring_count: int
+    particle_mass: wp.array
+    """real [particle_count], kg."""
+    particle_inv_mass: wp.array
+    """real [particle_count], 1/kg."""
+    spans: wp.array
+    """(i, j, count, class) of each run of springs, vec4i [span_count]."""
+    spring_classes: wp.array
+    """(rest length, stiffness, damping), real vec3 [class_count]; m, N/m, N s/m."""
+    chunk_start: wp.array
+    """First particle of each chunk, and the end of the last, int32 [chunk_count + 1]."""
+    chunk_body: wp.array
+    """int32 [chunk_count]."""
+    gravity: wp.array
+    """real vec3 [1], m/s^2."""
+    colliders: Any
+    """The table of kernels/contacts.py; a box of the scene is six half-spaces here."""
+    surface_particles: wp.array
+    """int32 [point_count], body after body."""
+    surface_quads: wp.array
+    """Indices into surface_particles, vec4i [face_count]."""
+
+
+@dataclass(frozen=True)
+class State:
+    """What changes, real [3, particle_count] each; updated in place."""
+
+    x: wp.array
+    """Positions, m."""
+    v: wp.array
+    """Velocities, m/s."""
+    f: wp.array
+    """Total forces, N."""
+
+
+def build(plan: Plan, *, device: str) -> tuple[Model, State]:
+    """Build every body and put the scene on a device at time zero."""
+    scene = plan.scene
+    real = PRECISIONS[scene.solver.precision]
+    vector = wp.types.vector(3, real)
+    bodies: list[Body] = []
+    positions, velocities, masses, spans, classes, chunks, chunk_bodies = [], [], [], [], [], [], []
+    surface_particles, surface_quads = [], []
+    particle_count = point_count = spring_count = 0
+    for number, body_plan in enumerate(plan.bodies):
+        body, material = body_plan.body, scene.materials[body_plan.body.material]
+        lattice = build_lattice(
+            body_plan.cells,
+            origin=body_plan.origin,
+            cell_size=body_plan.cell_size,
+            particles_per_edge=body_plan.particles_per_edge,
+        )
+        count = len(lattice.particles)
+        mass = _masses(lattice, material)
+        x, v = _place(lattice, mass, body_plan)
+        positions.append(x)
+        velocities.append(v)
+        masses.append(mass)
+        body_spans = springs_to_spans(lattice.springs, lattice.spring_kinds)
+        spans.append(body_spans + np.array([particle_count, particle_count, 0, 4 * number], np.int32))
+        classes.append(spring_classes(material, lattice.unit))
+        chunks.append(np.arange(particle_count, particle_count + count, CHUNK_SIZE, dtype=np.int32))
+        chunk_bodies.append(np.full(len(chunks[-1]), number, np.int32))
+        surface_particles.append(lattice.surface_particles + np.int32(particle_count))
+        surface_quads.append(lattice.surface_quads + np.int32(point_count))
+        points = len(lattice.surface_particles)
+        bodies.append(
+            Body(
+                name=str(body.name),
+                particles=slice(particle_count, particle_count + count),
+                points=slice(point_count, point_count + points),
+                quads=lattice.surface_quads,
+                unit=lattice.unit,
+            )
+        )
+        particle_count += count
+        point_count += points
+        spring_count += len(lattice.springs)
+
+    def array(data: Any, dtype: Any) -> wp.array:
+        return wp.array(np.asarray(data), dtype=dtype, device=device)
+
+    mass = np.concatenate(masses)
+    x, v = np.concatenate(positions), np.concatenate(velocities)
+    model = Model(
+        bodies=bodies,
+        real=real,
+        voxel_count=plan.voxel_count,
+        particle_count=particle_count,
+        spring_count=spring_count,
+        particle_mass=array(mass, real),
+        particle_inv_mass=array(1.0 / mass, real),
+        spans=array(np.concatenate(spans), wp.vec4i),
+        spring_classes=array(np.concatenate(classes), vector),
+        chunk_start=array(np.append(np.concatenate(chunks), np.int32(particle_count)), wp.int32),
+        chunk_body=array(np.concatenate(chunk_bodies), wp.int32),
+        gravity=array(scene.gravity_vector[None], vector),
+        colliders=_colliders(scene, [_center_of_mass(x[b.particles], mass[b.particles]) for b in bodies], real, device),
+        surface_particles=array(np.concatenate(surface_particles), wp.int32),
+        surface_quads=array(np.concatenate(surface_quads), wp.vec4i),
+    )
+    # Rows per component: see kernels/__init__.py.
+    state = State(
+        x=array(np.ascontiguousarray(x.T), real),
+        v=array(np.ascontiguousarray(v.T), real),
+        f=wp.zeros((3, particle_count), dtype=real, device=device),
+    )
+    return model, state
+
+
+def springs_to_spans(ends: np.ndarray, kinds: np.ndarray) -> np.ndarray:
+    """Join springs whose two ends both advance by one, int32 [span_count, 4] = (i, j, count, kind).
+
+    Args:
+        ends: particles of each spring, int32 [spring_count, 2].
+        kinds: class of each spring, int [spring_count].
+    """
+    first, second = ends.T
+    breaks = np.flatnonzero((np.diff(first) != 1) | (np.diff(second) != 1) | (np.diff(kinds) != 0)) + 1
+    start = np.concatenate([[0], breaks])
+    length = np.diff(np.append(start, len(ends)))
+    # Long runs are cut into pieces of MAX_SPAN.
+    pieces = -(-length // springs.MAX_SPAN)
+    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    begin = np.repeat(start, pieces) + springs.MAX_SPAN * piece
+    end = np.minimum(begin + springs.MAX_SPAN, np.repeat(start + length, pieces))
+    spans = np.stack([first[begin], second[begin], end - begin, kinds[begin]], axis=1).astype(np.int32)
+    # The springs of a particle close together in time find it still in the cache.
+    return spans[np.argsort(spans[:, 0], kind="stable")]
+
+
+def spring_classes(material: Material, unit: float) -> np.ndarray:
+    """Return (rest length [m], stiffness [N/m], damping [N s/m]) of the four kinds of springs, float64 [4, 3].
+
+    The law "strain", k_s (l/r - 1) with damping d_s / r, is Hooke's with k = k_s / r and d = d_s / r.
+    """
+    constants = [material.structural, material.shear, material.shear, material.bend]
+    rest = REST_LENGTHS * unit
+    scale = 1.0 / rest if material.law == "strain" else np.ones(4)
+    stiffness = scale * [c.stiffness for c in constants]
+    damping = scale * [c.damping for c in constants]
+    return np.stack([rest, stiffness, damping], axis=1)
+
+
+def _masses(lattice: Lattice, material: Material) -> np.ndarray:
+    """Return the mass of each particle, float64 [particle_count], kg."""
+    if material.density is not None:
+        return material.density * lattice.unit**3 / 8.0 * lattice.cell_counts
+    mass = 0.01 if material.particle_mass is None else material.particle_mass
+    return np.full(len(lattice.particles), mass)
+
+
+def _center_of_mass(positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    return mass @ positions / mass.sum()
+
+
+def _place(lattice: Lattice, mass: np.ndarray, plan: BodyPlan) -> tuple[np.ndarray, np.ndarray]:
+    """Return positions and velocities of a body at time zero, float64 [particle_count, 3] each."""
+    body = plan.body
+    turn = np.eye(3)
+    for axis, angle in enumerate(np.radians(body.rotation)):
+        u, w = (axis + 1) % 3, (axis + 2) % 3
+        about = np.eye(3)
+        about[[u, w], [u, w]] = np.cos(angle)
+        about[w, u], about[u, w] = np.sin(angle), -np.sin(angle)
+        turn = about @ turn
+    x = lattice.particles @ turn.T + body.position
+    arm = x - _center_of_mass(x, mass)
+    return x, np.asarray(body.velocity) + np.cross(body.angular_velocity, arm)
+
+
+def _colliders(scene: Scene, centers_of_mass: Sequence[np.ndarray], real: type, device: str) -> Any:
+    """Return the table of colliders for the kernels."""
+    rows = [row for collider in scene.colliders for row in _collider_rows(collider, scene, centers_of_mass)]
+    vector = wp.types.vector(3, real)
+    table = contacts.COLLIDERS[real]()
+    for name, dtype in [("kind", wp.int32), ("stiffness", real), ("damping", real)]:
+        setattr(table, name, wp.array(np.array([row[name] for row in rows]), dtype=dtype, device=device))
+    for name in ("center", "tangent", "bitangent", "normal", "size", "lower", "upper"):
+        data = np.array([row.get(name, np.zeros(3)) for row in rows], float).reshape(-1, 3)
+        setattr(table, name, wp.array(data, dtype=vector, device=device))
+    side = np.array([row["side"] for row in rows], float).reshape(-1, len(centers_of_mass))
+    table.side = wp.array(side, dtype=real, device=device)
+    return table
+
+
+def _collider_rows(collider: AnyCollider, scene: Scene, centers_of_mass: Sequence[np.ndarray]) -> list[dict[str, Any]]:
+    """Return the members of the table of kernels/contacts.py for one collider of the scene."""
+    center = np.array(collider.center)
+    everywhere = np.ones(len(centers_of_mass))
+    row = {"center": center, "stiffness": collider.stiffness, "damping": collider.damping, "side": everywhere}
+    if isinstance(collider, SphereCollider):
+        radius = np.full(3, collider.radius)
+        up = np.eye(3)[scene.up]
+        return [row | {"kind": contacts.SPHERE, "normal": up, "size": radius} | _volume(center, radius)]
+    if isinstance(collider, PlaneCollider):
+        tangent, bitangent, normal = collider.frame()
+        a, b = np.array(collider.size) / 2
+        # The solid part is a block from the front down to the threshold.
+        middle = center - normal * collider.threshold / 2
+        reach = np.abs([a * tangent, b * bitangent, normal * collider.threshold / 2]).sum(axis=0)
+        directions = {"tangent": tangent, "bitangent": bitangent, "normal": normal}
+        size = {"size": [a, b, collider.threshold]}
+        return [row | {"kind": contacts.PLANE} | directions | size | _volume(middle, reach)]
+    if isinstance(collider, BoxCollider):
+        walls = []
+        for axis in range(3):
+            for sign in (-1.0, 1.0):
+                outward = sign * np.eye(3)[axis]
+                wall = {"center": center + outward * collider.size[axis] / 2, "normal": -outward}
+                walls.append(row | {"kind": contacts.HALF_SPACE} | wall)
+        return walls
+    normal = np.array(collider.normal) / np.linalg.norm(collider.normal)
+    side = [-1.0 if (com - center) @ normal < 0 else 1.0 for com in centers_of_mass]
+    return [row | {"kind": contacts.HALF_SPACE, "normal": normal, "side": side}]
+
+
+def _volume(center: np.ndarray, reach: np.ndarray) -> dict[str, np.ndarray]:
+    """Return the box around a collider, grown so that rounding never makes it too small."""
+    margin = VOLUME_MARGIN * (1.0 + np.abs(center) + reach)
+    return {"lower": center - reach - margin, "upper": center + reach + margin}

@@ -1,0 +1,149 @@
+"""What a scene will take, before it is built: the grid of every body, counts and memory."""
+
+from __future__ import annotations
+
+import logging
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .errors import InputError
+from .lattice import count_lattice
+from .scene import Body, CubeBody, ModelBody, Scene, VoxelsBody
+
+log = logging.getLogger("warpjelly")
+
+# Largest indices that the int32 arrays of particles and of surface quads can hold.
+MAX_PARTICLES = 2**31 - 1
+
+# Bytes at the peak of building a scene; measured on solid cubes of 32^3 to 128^3 particles.
+BYTES_AT_REST = 350e6
+BYTES_PER_UNIT_CELL = 110
+BYTES_PER_PARTICLE = {"float32": 160, "float64": 210}
+BYTES_PER_SPRING = 26
+# Scan conversion holds one byte per cell three times.
+BYTES_PER_GRID_CELL = 4
+
+
+@dataclass(frozen=True)
+class BodyPlan:
+    """One body as a grid of jelly cubes."""
+
+    body: Body
+    cells: np.ndarray
+    """Occupied jelly cubes, bool [nx, ny, nz]."""
+    origin: np.ndarray
+    """Lowest corner of the grid in the frame of the body, float64 [3], m."""
+    cell_size: float
+    """Edge of a jelly cube, m."""
+    particles_per_edge: int
+    particle_count: int
+    spring_bound: int
+    """No more springs than this."""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """All bodies of a scene, and what simulating them takes."""
+
+    scene: Scene
+    bodies: list[BodyPlan]
+
+    @property
+    def voxel_count(self) -> int:
+        """Number of jelly cubes."""
+        return sum(int(np.count_nonzero(plan.cells)) for plan in self.bodies)
+
+    @property
+    def particle_count(self) -> int:
+        """Number of particles."""
+        return sum(plan.particle_count for plan in self.bodies)
+
+    @property
+    def spring_bound(self) -> int:
+        """No more springs than this."""
+        return sum(plan.spring_bound for plan in self.bodies)
+
+    @property
+    def memory_bytes(self) -> int:
+        """Estimated peak of memory, bytes."""
+        unit_cells = max(plan.cells.size * (plan.particles_per_edge - 1) ** 3 for plan in self.bodies)
+        return int(
+            BYTES_AT_REST
+            + BYTES_PER_UNIT_CELL * unit_cells
+            + BYTES_PER_PARTICLE[self.scene.solver.precision] * self.particle_count
+            + BYTES_PER_SPRING * self.spring_bound
+        )
+
+
+def plan_scene(scene: Scene) -> Plan:
+    """Make the grid of every body and count what follows from it.
+
+    Raises:
+        InputError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
+    """
+    plan = Plan(scene, [_plan_body(body) for body in scene.bodies])
+    if plan.particle_count > MAX_PARTICLES:
+        raise InputError(f"{plan.particle_count:,} particles are more than the {MAX_PARTICLES:,} that indices can hold")
+    _require_memory(plan.memory_bytes, f"{plan.particle_count:,} particles and {plan.spring_bound:,} springs")
+    return plan
+
+
+def _plan_body(body: Body) -> BodyPlan:
+    if isinstance(body, CubeBody):
+        cells, cell_size = np.ones((1, 1, 1), bool), body.size
+        origin = np.full(3, -body.size / 2)
+    elif isinstance(body, VoxelsBody):
+        cells, cell_size = body.grid(), body.cell_size
+        origin = -np.array(cells.shape) * cell_size / 2
+    elif isinstance(body, ModelBody):
+        cells, origin, cell_size = _voxelize_model(body)
+    else:
+        raise TypeError(f"unknown body {type(body).__name__}")
+    particles, springs = count_lattice(cells, particles_per_edge=body.particles_per_edge)
+    return BodyPlan(body, cells, origin, cell_size, body.particles_per_edge, particles, springs)
+
+
+def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
+    # These imports take most of a second, which scenes without models need not spend.
+    from .meshes import load_mesh
+    from .voxelize import voxelize
+
+    mesh = load_mesh(body.file)
+    sides = np.ceil(mesh.extents / mesh.extents.max() * body.resolution).astype(int)
+    cell_count = int(np.prod(np.maximum(sides, 1).astype(object)))
+    _require_memory(
+        BYTES_AT_REST + BYTES_PER_GRID_CELL * cell_count, f"bodies.{body.name}: a grid of {cell_count:,} cells"
+    )
+    grid = voxelize(np.asarray(mesh.triangles) * body.scale, body.resolution)
+    if grid.open_columns or not mesh.is_watertight:
+        log.warning(
+            "%s: the mesh is not watertight; %d of its %d columns of voxels run through a hole and may be wrong",
+            body.file, grid.open_columns, grid.cells.shape[1] * grid.cells.shape[2],
+        )  # fmt: skip
+    if not grid.cells.any():
+        raise InputError(
+            f"{body.file}: no cell of the grid has its centre inside the model at resolution {body.resolution}; "
+            f"its parts are thinner than a cell of {grid.cell_size:.3g} m: raise the resolution"
+        )
+    return grid.cells, grid.origin, grid.cell_size
+
+
+def _require_memory(needed: float, what: str) -> None:
+    available = memory_limit()
+    if needed > available:
+        raise InputError(
+            f"{what} need about {needed / 1e9:.1f} GB of memory, of {available / 1e9:.1f} GB on this machine; "
+            "lower the resolution or the particles per edge"
+        )
+
+
+def memory_limit() -> float:
+    """Return how much memory this process may use, bytes: that of the machine or of its control group."""
+    limit = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if hasattr(os, "sysconf") else float("inf")
+    group = Path("/sys/fs/cgroup/memory.max")
+    if group.is_file() and (text := group.read_text().strip()).isdigit():
+        limit = min(limit, float(text))
+    return limit

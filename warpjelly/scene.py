@@ -1,0 +1,539 @@
+"""The scene file: a validated, typed description of what to simulate, and nothing else.
+
+A scene is TOML. Each class here is one table of it; field descriptions carry units and defaults, and
+``scenes/schema.json`` (written by ``python -m warpjelly.scene``) carries them into editors.
+"""
+
+from __future__ import annotations
+
+import difflib
+import json
+import math
+import tomllib
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self, get_args
+
+import numpy as np
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    StringConstraints,
+    ValidationError,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
+
+from .errors import InputError
+
+# Lengths and coordinates beyond this [m], and other magnitudes beyond the second, are typing errors, not scenes.
+MAX_LENGTH = 1e5
+MAX_MAGNITUDE = 1e12
+# A scene asks for at most this many samples and substeps per frame; more would never finish.
+MAX_FRAMES = 1_000_000
+MAX_SUBSTEPS = 1_000_000
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
+Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_MAGNITUDE)]
+NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_MAGNITUDE)]
+Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_LENGTH, le=MAX_LENGTH)]
+Length = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-6, le=MAX_LENGTH)]
+Vector = tuple[Number, Number, Number]
+Point = tuple[Coordinate, Coordinate, Coordinate]
+Switch = Annotated[bool, Field(strict=True)]
+# Names become prim names in the stage, so they are USD identifiers.
+Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=64)]
+
+
+class Table(BaseModel):
+    """Base of every table of a scene: immutable, and unknown keys are errors that suggest the right one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _suggest_known_keys(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        for key in data:
+            if key not in cls.model_fields:
+                close = difflib.get_close_matches(str(key), cls.model_fields, n=1)
+                hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(cls.model_fields)}"
+                raise PydanticCustomError("unknown_key", "{hint}", {"hint": hint, "key": str(key)})
+        return data
+
+
+class Solver(Table):
+    """How time advances."""
+
+    integrator: Literal["semi_implicit_euler"] = Field("semi_implicit_euler", description="time integration scheme")
+    dt: float = Field(
+        1e-3,
+        strict=True,
+        ge=1e-9,
+        le=1.0,
+        allow_inf_nan=False,
+        description="largest time step, s; the step used is the largest one below it that divides a frame",
+    )
+    precision: Literal["float32", "float64"] = Field("float32", description="floating-point type of the simulation")
+    culling: Switch = Field(
+        True, description="skip contact tests of particles whose bounding box is clear; same result"
+    )
+
+
+class SpringConstants(Table):
+    """Stiffness and damping of one kind of spring, in the units of the material's law."""
+
+    stiffness: NotNegative = Field(400.0, description="N with law strain, N/m with law hooke")
+    damping: NotNegative = Field(0.6, description="N s with law strain, N s/m with law hooke")
+
+
+class Material(Table):
+    """What a body is made of."""
+
+    law: Literal["strain", "hooke"] = Field(
+        "strain", description="strain: force = k (l/r - 1), the same at every spring length; hooke: force = k (l - r)"
+    )
+    particle_mass: Positive | None = Field(
+        None, description="kg, the same for every particle; 0.01 unless density is given"
+    )
+    density: Positive | None = Field(None, description="kg/m^3; an eighth of a unit cell's mass goes to each corner")
+    structural: SpringConstants = Field(SpringConstants(), description="springs to the 6 direct neighbours")
+    shear: SpringConstants = Field(SpringConstants(), description="springs to the 12 face and 8 body diagonals")
+    bend: SpringConstants = Field(SpringConstants(), description="springs to the second neighbours along each axis")
+
+    @model_validator(mode="after")
+    def _mass_is_given_once(self) -> Self:
+        if self.particle_mass is not None and self.density is not None:
+            raise PydanticCustomError("mass", "give particle_mass or density, not both")
+        return self
+
+
+class Body(Table):
+    """What all bodies have: a name, a material and a placement."""
+
+    name: Name | None = Field(None, description="prim name in the stage; the type and a number unless given")
+    material: Name = Field(description="one of [materials]")
+    position: Point = Field((0.0, 0.0, 0.0), description="where the body's origin is put, m")
+    rotation: Vector = Field((0.0, 0.0, 0.0), description="degrees about x, then y, then z, through the body's origin")
+    velocity: Vector = Field((0.0, 0.0, 0.0), description="of the centre of mass, m/s")
+    angular_velocity: Vector = Field((0.0, 0.0, 0.0), description="about the centre of mass, rad/s")
+
+
+class CubeBody(Body):
+    """One jelly cube; its origin is its centre."""
+
+    type: Literal["cube"]
+    size: Length = Field(1.0, description="edge, m")
+    particles_per_edge: int = Field(8, strict=True, ge=2, le=4096, description="particles along an edge")
+
+
+class VoxelsBody(Body):
+    """Jelly cubes on a grid drawn in the scene; the origin is the centre of the grid."""
+
+    type: Literal["voxels"]
+    layers: list[list[str]] = Field(
+        min_length=1,
+        description="layers along +y from the bottom up; each a list of rows along +z; each row a string along +x "
+        "with # for a jelly cube and . for none",
+    )
+    cell_size: Length = Field(0.1, description="edge of one jelly cube, m")
+    particles_per_edge: int = Field(
+        2, strict=True, ge=2, le=256, description="particles along an edge of each jelly cube"
+    )
+
+    @field_validator("layers")
+    @classmethod
+    def _layers_form_a_grid(cls, layers: list[list[str]]) -> list[list[str]]:
+        rows, width = len(layers[0]), len(layers[0][0]) if layers[0] else 0
+        for y, layer in enumerate(layers):
+            if len(layer) != rows or any(len(row) != width for row in layer):
+                raise PydanticCustomError("layers", f"layer {y} has not the shape of layer 0 ({rows} rows of {width})")
+            if stray := set("".join(layer)) - {"#", "."}:
+                raise PydanticCustomError("layers", f"layer {y} has {min(stray)!r}; use # for a cube and . for none")
+        if not any("#" in row for layer in layers for row in layer):
+            raise PydanticCustomError("layers", "the grid has no jelly cube (#)")
+        return layers
+
+    def grid(self) -> np.ndarray:
+        """Return the occupied cells, bool [x, y, z]."""
+        filled = np.array([[[c == "#" for c in row] for row in layer] for layer in self.layers])
+        return np.ascontiguousarray(filled.transpose(2, 0, 1))
+
+
+class ModelBody(Body):
+    """A mesh turned into jelly cubes; the origin is that of the model file."""
+
+    type: Literal["model"]
+    file: Path = Field(description="mesh file, relative to the scene file")
+    scale: Length = Field(1.0, description="metres per unit of the model file")
+    resolution: int = Field(strict=True, ge=1, le=4096, description="jelly cubes along the longest edge")
+    particles_per_edge: int = Field(
+        2, strict=True, ge=2, le=256, description="particles along an edge of each jelly cube"
+    )
+
+    @field_validator("file", mode="after")
+    @classmethod
+    def _file_is_relative_to_the_scene(cls, file: Path, info: ValidationInfo) -> Path:
+        file = Path((info.context or {}).get("folder", "."), file).absolute()
+        if not file.is_file():
+            raise PydanticCustomError("file", "no such file ({path})", {"path": str(file)})
+        return file
+
+
+class Collider(Table):
+    """What all colliders have: a name and a penalty spring."""
+
+    name: Name | None = Field(None, description="prim name in the stage; the type and a number unless given")
+    stiffness: Positive = Field(2000.0, description="N/m of penetration depth, per particle")
+    damping: NotNegative = Field(1.0, description="N s/m along the normal, per particle; the contact never pulls")
+
+
+def _require_direction(vector: tuple[float, float, float], what: str) -> None:
+    if math.hypot(*vector) < 1e-9:
+        raise PydanticCustomError("direction", "{what} must not be zero", {"what": what})
+
+
+class HalfSpaceCollider(Collider):
+    """An infinite flat wall; each body stays on the side where its centre of mass starts."""
+
+    type: Literal["half_space"]
+    center: Point = Field((0.0, 0.0, 0.0), description="a point of the wall, m")
+    normal: Vector = Field(description="perpendicular to the wall; any length")
+
+    @model_validator(mode="after")
+    def _normal_is_a_direction(self) -> Self:
+        _require_direction(self.normal, "normal")
+        return self
+
+
+class PlaneCollider(Collider):
+    """A rectangle, solid from its front down to the threshold behind it."""
+
+    type: Literal["plane"]
+    center: Point = Field((0.0, 0.0, 0.0), description="m")
+    normal: Vector = Field(description="points out of the front; any length")
+    tangent: Vector | None = Field(None, description="direction of the first side; chosen unless given")
+    size: tuple[Length, Length] = Field(description="both sides, m")
+    threshold: Length = Field(0.1, description="depth behind the plane down to which it acts, m")
+
+    @model_validator(mode="after")
+    def _directions_span_the_plane(self) -> Self:
+        _require_direction(self.normal, "normal")
+        if self.tangent is not None:
+            _require_direction(self.tangent, "tangent")
+            n, t = np.array(self.normal), np.array(self.tangent)
+            if np.linalg.norm(np.cross(n, t)) < 1e-6 * np.linalg.norm(n) * np.linalg.norm(t):
+                raise PydanticCustomError("direction", "tangent must not be parallel to normal")
+        return self
+
+    def frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return the unit vectors (tangent, bitangent, normal), float64 [3] each, right-handed."""
+        normal = np.array(self.normal) / np.linalg.norm(self.normal)
+        # Without a tangent, the axis that is least aligned with the normal gives the best-conditioned one.
+        tangent = np.array(self.tangent) if self.tangent is not None else np.eye(3)[np.argmin(np.abs(normal))]
+        tangent = tangent - normal * (tangent @ normal)
+        tangent /= np.linalg.norm(tangent)
+        return tangent, np.cross(normal, tangent), normal
+
+
+class SphereCollider(Collider):
+    """A solid ball."""
+
+    type: Literal["sphere"]
+    center: Point = Field((0.0, 0.0, 0.0), description="m")
+    radius: Length = Field(description="m")
+
+
+class BoxCollider(Collider):
+    """A room: bodies stay inside its six walls."""
+
+    type: Literal["box"]
+    center: Point = Field((0.0, 0.0, 0.0), description="m")
+    size: tuple[Length, Length, Length] = Field(description="edges along x, y and z, m")
+
+
+class Output(Table):
+    """What is written."""
+
+    force_range: tuple[NotNegative, NotNegative] | Literal["auto"] = Field(
+        "auto", description="forces at both ends of the colour map, N; auto: 1st to 99th percentile of the run"
+    )
+    color: Literal["indexed", "rgb"] = Field(
+        "indexed", description="indexed: a colour table and one small index per point; rgb: for readers without indices"
+    )
+    velocities: Switch = Field(False, description="write point velocities, for motion blur")
+
+    @field_validator("force_range")
+    @classmethod
+    def _range_ascends(cls, value: Any) -> Any:
+        if value != "auto" and not value[0] < value[1]:
+            raise PydanticCustomError("range", "the first force must be below the second")
+        return value
+
+
+class Expectation(Table):
+    """Bounds on one measured quantity; at least one of them."""
+
+    body: Name | None = Field(None, description="which body is measured; may be left out when there is one")
+    min: Number | None = Field(None, description="smallest allowed value")
+    max: Number | None = Field(None, description="largest allowed value")
+
+    @model_validator(mode="after")
+    def _something_is_bounded(self) -> Self:
+        if self.min is None and self.max is None:
+            raise PydanticCustomError("expectation", "give min, max or both")
+        return self
+
+
+class Expect(Table):
+    """What the scene is for, as numbers; ``warpjelly run`` measures and reports them."""
+
+    rest_height: Expectation | None = Field(None, description="height of the centre of mass at the end, m")
+    displacement: Expectation | None = Field(None, description="distance of the centre of mass from its start, m")
+    speed: Expectation | None = Field(None, description="greatest particle speed at the end, m/s")
+    shape_error: Expectation | None = Field(
+        None,
+        description="rms distance from the best rigid fit of the rest shape at the end, share of the body's diagonal",
+    )
+    squash: Expectation | None = Field(None, description="least height of the body over the run, share of its first")
+    bounce: Expectation | None = Field(None, description="greatest rise of the centre of mass after its first low, m")
+    penetration: Expectation | None = Field(
+        None, description="greatest depth of a particle in a collider over the run, in unit cells"
+    )
+
+    def items(self) -> Iterator[tuple[str, Expectation]]:
+        """Yield the quantities that are bounded, by name."""
+        for name in type(self).model_fields:
+            if (expectation := getattr(self, name)) is not None:
+                yield name, expectation
+
+
+AnyBody = Annotated[CubeBody | VoxelsBody | ModelBody, Field(discriminator="type")]
+AnyCollider = Annotated[HalfSpaceCollider | PlaneCollider | SphereCollider | BoxCollider, Field(discriminator="type")]
+
+
+class Scene(Table):
+    """A whole scene."""
+
+    name: Name = Field(description="names the run directory; the file's name unless given")
+    duration: Positive | None = Field(None, description="s; 2 unless frames is given")
+    frames: int | None = Field(
+        None, strict=True, ge=1, le=MAX_FRAMES, description="number of samples, instead of duration"
+    )
+    fps: float = Field(60.0, strict=True, allow_inf_nan=False, ge=0.1, le=1e5, description="samples per second")
+    up_axis: Literal["Y", "Z"] = Field("Y", description="which axis points up")
+    gravity: Vector | None = Field(None, description="m/s^2; 9.81 downwards unless given")
+    solver: Solver = Field(Solver(), description="time integration")
+    materials: dict[Name, Material] = Field(min_length=1, description="materials by name")
+    bodies: list[AnyBody] = Field(min_length=1, description="what is made of jelly")
+    colliders: list[AnyCollider] = Field([], description="what the bodies collide with")
+    output: Output = Field(Output(), description="what is written")
+    expect: Expect = Field(Expect(), description="what the scene is for, as numbers")
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_nameless_prims(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        data = dict(data)
+        for key in ("bodies", "colliders"):
+            if isinstance(entries := data.get(key), Sequence) and not isinstance(entries, str):
+                data[key] = [
+                    {"name": f"{entry.get('type', 'unknown')}_{i}", **entry} if isinstance(entry, Mapping) else entry
+                    for i, entry in enumerate(entries)
+                ]
+        return data
+
+    @model_validator(mode="after")
+    def _parts_fit_together(self) -> Self:
+        def refuse(key: str, value: object, why: str) -> None:
+            raise PydanticCustomError("scene", "{why}", {"key": key, "why": why, "value": value})
+
+        for key, parts in (("bodies", self.bodies), ("colliders", self.colliders)):
+            for i, part in enumerate(parts):
+                if part.name in [earlier.name for earlier in parts[:i]]:
+                    refuse(f"{key}.{i}.name", part.name, "this name is taken; names must differ")
+        for i, body in enumerate(self.bodies):
+            if body.material not in self.materials:
+                known = ", ".join(self.materials)
+                refuse(f"bodies.{i}.material", body.material, f"no such material; materials of this scene: {known}")
+        for quantity, expectation in self.expect.items():
+            bodies = ", ".join(str(body.name) for body in self.bodies)
+            if expectation.body is None and len(self.bodies) > 1:
+                refuse(f"expect.{quantity}.body", None, f"name one of the bodies: {bodies}")
+            if expectation.body is not None and expectation.body not in bodies.split(", "):
+                refuse(f"expect.{quantity}.body", expectation.body, f"no such body; bodies: {bodies}")
+        if self.duration is not None and self.frames is not None:
+            refuse("duration", self.duration, "give duration or frames, not both")
+        if self.duration is not None and not 1 <= round(self.duration * self.fps) <= MAX_FRAMES:
+            refuse("duration", self.duration, f"at {self.fps:g} fps this is not between 1 and {MAX_FRAMES} frames")
+        if self.substeps > MAX_SUBSTEPS:
+            refuse("solver.dt", self.solver.dt, f"more than {MAX_SUBSTEPS} substeps a frame at {self.fps:g} fps")
+        return self
+
+    @property
+    def frame_count(self) -> int:
+        """Number of samples, at time codes 0 to ``frame_count - 1``; the first is the initial state."""
+        return self.frames if self.frames is not None else round((self.duration or 2.0) * self.fps)
+
+    @property
+    def substeps(self) -> int:
+        """Substeps per frame: as many as the largest step that divides a frame and does not exceed ``dt`` takes."""
+        # The tolerance keeps 1/60 s at dt = 1/600 s at ten substeps, whatever the last bit of the quotient.
+        return max(1, math.ceil(1.0 / (self.fps * self.solver.dt) * (1 - 1e-9)))
+
+    @property
+    def dt(self) -> float:
+        """The time step used, s."""
+        return 1.0 / (self.fps * self.substeps)
+
+    @property
+    def up(self) -> int:
+        """Index of the axis that points up."""
+        return {"Y": 1, "Z": 2}[self.up_axis]
+
+    @property
+    def gravity_vector(self) -> np.ndarray:
+        """Acceleration of gravity, float64 [3], m/s^2."""
+        return np.array(self.gravity) if self.gravity is not None else -9.81 * np.eye(3)[self.up]
+
+
+def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) -> Scene:
+    """Read and validate a scene file.
+
+    Args:
+        path: TOML file.
+        overrides: values by dotted key, for example ``{"solver.dt": 5e-4, "bodies.0.size": 2.0}``; an entry of a list
+            goes by its number or its name.
+
+    Raises:
+        InputError: the file cannot be read, is not TOML, or is not a scene; the message names file, key and value.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
+    for key, value in (overrides or {}).items():
+        _override(data, key, value)
+    data.setdefault("name", _identifier(path.stem))
+    try:
+        return Scene.model_validate(data, context={"folder": path.parent})
+    except ValidationError as error:
+        raise InputError(f"{path}: {_explain(error)}") from error
+
+
+def _override(data: dict[str, Any], key: str, value: Any) -> None:
+    """Set a dotted key in nested tables and lists, making tables on the way."""
+    *parents, last = key.split(".")
+    node: Any = data
+    for part in parents:
+        if isinstance(node, list):
+            node = node[_entry(node, part, key)]
+        elif isinstance(node, dict):
+            node = node.setdefault(part, {})
+        else:
+            raise InputError(f"--set {key}: '{part}' is inside a value that is not a table")
+    if isinstance(node, list):
+        node[_entry(node, last, key)] = value
+    elif isinstance(node, dict):
+        node[last] = value
+    else:
+        raise InputError(f"--set {key}: '{last}' is inside a value that is not a table")
+
+
+def _entry(entries: list[Any], part: str, key: str) -> int:
+    """Return the position of a list entry given by its number or its name."""
+    names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
+    if part in names:
+        return names.index(part)
+    if part.isdigit() and int(part) < len(entries):
+        return int(part)
+    known = ", ".join([f"0 to {len(entries) - 1}", *(name for name in names if name)]) if entries else "none"
+    raise InputError(f"--set {key}: no entry '{part}'; entries: {known}")
+
+
+def _identifier(text: str) -> str:
+    """Turn a file name into a valid scene name."""
+    name = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:63]
+    return name if name and not name[0].isdigit() else f"_{name}"
+
+
+def _explain(error: ValidationError) -> str:
+    """Say in one line what is wrong with the scene first: key, value, what is allowed."""
+    problems = error.errors(include_url=False)
+    first = problems[0]
+    context = first.get("ctx", {})
+    value = first["input"]
+    key = context["key"] if first["type"] == "scene" else _key(first["loc"])
+    what = first["msg"].replace("Input should", "must").replace("Value should", "must")
+    if first["type"] == "unknown_key":
+        key = ".".join(filter(None, [key, context["key"]]))
+        message = f"{key}: unknown key; {what}"
+    elif first["type"] == "missing":
+        message = f"{key}: missing; this key is required{_described(first['loc'])}"
+    elif first["type"] == "union_tag_not_found":
+        message = f"{key}.type: missing; this key is required"
+    elif first["type"] == "union_tag_invalid":
+        message = f"{key}.type = {context['tag']!r}: must be one of {context['expected_tags']}"
+    elif first["type"] == "scene":
+        message = f"{key} = {_shown(context['value'])}: {what}" if context["value"] is not None else f"{key}: {what}"
+    elif isinstance(value, Mapping):
+        message = f"{key}: {what}"
+    else:
+        message = f"{key} = {_shown(value)}: {what}{_described(first['loc'])}"
+    return message + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")
+
+
+def _key(location: tuple[int | str, ...]) -> str:
+    """Return the dotted key of an error, without the tags that pydantic adds for bodies, colliders and unions."""
+    parts = [str(part) for part in location]
+    if len(parts) > 2 and parts[0] in ("bodies", "colliders"):
+        del parts[2]
+    return ".".join(part for part in parts if "[" not in part and not part.startswith("literal"))
+
+
+def _described(location: tuple[int | str, ...]) -> str:
+    """Return the description of the field at an error, in brackets."""
+    tables: list[type[Table]] = [Scene]
+    description = None
+    for part in location:
+        if fields := [table.model_fields[part] for table in tables if part in table.model_fields]:
+            description = fields[0].description
+            tables = [table for field in fields for table in _tables_in(field.annotation)]
+        elif tagged := [table for table in tables if part in _tags(table)]:
+            tables = tagged
+    return f" ({description})" if description else ""
+
+
+def _tables_in(annotation: Any) -> list[type[Table]]:
+    """Return the tables that a field's annotation mentions."""
+    if isinstance(annotation, type) and issubclass(annotation, Table):
+        return [annotation]
+    return [table for part in get_args(annotation) for table in _tables_in(part)]
+
+
+def _tags(table: type[Table]) -> tuple[str, ...]:
+    """Return the values of ``type`` that select a table."""
+    return get_args(table.model_fields["type"].annotation) if "type" in table.model_fields else ()
+
+
+def _shown(value: Any) -> str:
+    """Write a value as TOML would, cut when long."""
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError):
+        text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+if __name__ == "__main__":
+    print(json.dumps(Scene.model_json_schema(), indent=2))

@@ -1,0 +1,259 @@
+"""Substeps, culling and graph capture: a scene in motion."""
+
+from __future__ import annotations
+
+import logging
+import threading
+from typing import Any
+
+import numpy as np
+import warp as wp
+
+from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, springs, surfaces
+
+from .device import choose_device
+from .errors import DivergedError
+from .model import Model, State, build
+from .plan import Plan, plan_scene
+from .scene import Scene
+from .surface import SurfaceFrame
+
+log = logging.getLogger("warpjelly")
+
+# A captured graph holds at most this many substeps; longer frames replay it. Capturing costs as much as ten replays.
+MAX_CAPTURED_SUBSTEPS = 64
+# Warp cannot capture in two threads at once.
+_capture_lock = threading.Lock()
+
+
+class Simulator:
+    """A scene in motion.
+
+    Args:
+        scene: what to simulate, or its plan.
+        device: "auto", "cpu", "cuda:0" ...
+
+    Raises:
+        InputError: the scene cannot be built, or there is no such device.
+    """
+
+    def __init__(self, scene: Scene | Plan, *, device: str = "auto") -> None:
+        plan = scene if isinstance(scene, Plan) else plan_scene(scene)
+        self.scene = plan.scene
+        self.device = choose_device(device)
+        self.model: Model
+        self.state: State
+        self.model, self.state = build(plan, device=self.device)
+        self.substep_count = 0
+        """Substeps since the start."""
+        chunk_count = len(self.model.chunk_body)
+        point_count = len(self.model.surface_particles)
+        with wp.ScopedDevice(self.device):
+            self._lower = wp.zeros((3, chunk_count), dtype=self.model.real)
+            self._upper = wp.zeros((3, chunk_count), dtype=self.model.real)
+            self._non_finite = wp.zeros(1, dtype=wp.int32)
+            self._elastic = wp.zeros(1, dtype=wp.float64)
+            self._sums = wp.zeros((chunk_count, diagnostics.COLUMNS), dtype=wp.float64)
+            self._points = wp.zeros(point_count, dtype=wp.vec3f)
+            self._normals = wp.zeros(point_count, dtype=wp.vec3f)
+            self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
+            self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
+        self._graphs: dict[int, Any] = {}
+        self._capturable = True
+        self._add_forces()
+
+    @property
+    def time(self) -> float:
+        """Simulated time, s."""
+        return self.substep_count * self.scene.dt
+
+    @property
+    def positions(self) -> np.ndarray:
+        """Positions, [particle_count, 3], m; a copy."""
+        return self._copy(self.state.x)
+
+    @property
+    def velocities(self) -> np.ndarray:
+        """Velocities, [particle_count, 3], m/s; a copy."""
+        return self._copy(self.state.v)
+
+    @property
+    def forces(self) -> np.ndarray:
+        """Total forces of the last substep (at the start, those at time zero), [particle_count, 3], N; a copy."""
+        return self._copy(self.state.f)
+
+    @property
+    def masses(self) -> np.ndarray:
+        """Masses, [particle_count], kg; a copy."""
+        return self.model.particle_mass.numpy().copy()
+
+    def step(self, count: int = 1) -> None:
+        """Advance by a number of substeps."""
+        block = min(self.scene.substeps, MAX_CAPTURED_SUBSTEPS)
+        for substeps in [block] * (count // block) + [1] * (count % block):
+            self._replay(substeps)
+        self.substep_count += count
+
+    def advance_frame(self) -> None:
+        """Advance by one frame.
+
+        Raises:
+            DivergedError: a position or velocity is not finite any more.
+        """
+        self.step(self.scene.substeps)
+        if (particle := self.first_non_finite()) is not None:
+            body = next(body for body in self.model.bodies if particle < body.particles.stop)
+            raise DivergedError(
+                f"the simulation diverged before t = {self.time:.4g} s: particle {particle - body.particles.start} of "
+                f"'{body.name}' left the finite numbers; lower solver.dt (now {self.scene.dt:.3g} s), or stiffness and "
+                "damping of its material or of a collider"
+            )
+
+    def first_non_finite(self) -> int | None:
+        """Return the smallest index of a particle that is not at a finite place or speed, None if all are."""
+        self._non_finite.fill_(self.model.particle_count)
+        self._launch(
+            diagnostics.find_non_finite, self.model.particle_count, [self.state.x, self.state.v], [self._non_finite]
+        )
+        first = int(self._non_finite.numpy()[0])
+        return first if first < self.model.particle_count else None
+
+    def diagnostics(self) -> dict[str, Any]:
+        """Measure the current state.
+
+        Returns:
+            ``kinetic``, ``elastic``, ``potential`` (of gravity, zero at the origin) and ``contact`` (in penetrated
+            colliders) energy, J; ``momentum`` [3], kg m/s; ``angular_momentum`` [3] about the origin, kg m^2/s;
+            ``max_speed``, m/s; ``max_penetration``, m; ``contacts``, the number of particles in each collider summed.
+        """
+        model, state = self.model, self.state
+        self._elastic.zero_()
+        self._launch(
+            diagnostics.add_elastic_energy,
+            len(model.spans),
+            [model.spans, model.spring_classes, state.x],
+            [self._elastic],
+        )
+        self._launch(
+            diagnostics.measure_chunks,
+            len(model.chunk_body),
+            [
+                model.particle_mass,
+                model.gravity,
+                model.chunk_start,
+                model.chunk_body,
+                model.colliders,
+                state.x,
+                state.v,
+            ],
+            [self._sums],
+        )
+        sums = self._sums.numpy()
+        total, greatest = sums.sum(axis=0), sums.max(axis=0)
+        return {
+            "kinetic": float(total[diagnostics.KINETIC]),
+            "elastic": float(self._elastic.numpy()[0]),
+            "potential": float(total[diagnostics.POTENTIAL]),
+            "contact": float(total[diagnostics.CONTACT]),
+            "momentum": total[diagnostics.MOMENTUM :][:3].copy(),
+            "angular_momentum": total[diagnostics.ANGULAR_MOMENTUM :][:3].copy(),
+            "max_speed": float(greatest[diagnostics.SPEED]),
+            "max_penetration": float(greatest[diagnostics.DEPTH]),
+            "contacts": int(total[diagnostics.CONTACTS]),
+        }
+
+    def surfaces(self) -> list[SurfaceFrame]:
+        """Return what a frame shows of each body, as copies."""
+        model, state = self.model, self.state
+        self._launch(
+            surfaces.gather_surface,
+            len(model.surface_particles),
+            [model.surface_particles, state.x, state.v, state.f],
+            [self._points, self._velocities, self._magnitudes, self._normals],
+        )
+        self._launch(
+            surfaces.add_quad_normals, len(model.surface_quads), [model.surface_quads, self._points], [self._normals]
+        )
+        self._launch(surfaces.normalize, len(self._normals), [], [self._normals])
+        points, normals, velocities, magnitudes = (
+            array.numpy() for array in (self._points, self._normals, self._velocities, self._magnitudes)
+        )
+        # On the CPU numpy() is a live view of the array, which the next frame overwrites.
+        return [
+            SurfaceFrame(
+                points=points[body.points].copy(),
+                normals=normals[body.points].copy(),
+                velocities=velocities[body.points].copy(),
+                forces=magnitudes[body.points].copy(),
+            )
+            for body in model.bodies
+        ]
+
+    @staticmethod
+    def _copy(rows: wp.array) -> np.ndarray:
+        return np.ascontiguousarray(rows.numpy().T)
+
+    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list[Any], outputs: list[Any]) -> None:
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+
+    def _replay(self, substeps: int) -> None:
+        """Run substeps as one captured graph, or as plain launches where graphs cannot be captured."""
+        if self._capturable and substeps not in self._graphs:
+            self._graphs[substeps] = self._capture(substeps)
+        if self._capturable:
+            wp.capture_launch(self._graphs[substeps])
+        else:
+            for _ in range(substeps):
+                self._substep()
+
+    def _capture(self, substeps: int) -> Any:
+        with _capture_lock:
+            try:
+                # Kernels compile at their first launch, which must not happen inside a capture; the constructor has
+                # launched those of the forces.
+                wp.load_module(integrators, device=self.device)
+                with wp.ScopedCapture(device=self.device) as capture:
+                    for _ in range(substeps):
+                        self._substep()
+            except RuntimeError as error:
+                self._capturable = False
+                log.warning(
+                    "%s cannot capture graphs (%s); launching kernel by kernel, which is slower", self.device, error
+                )
+                return None
+        return capture.graph
+
+    def _substep(self) -> None:
+        self._add_forces()
+        model, state = self.model, self.state
+        self._launch(
+            integrators.semi_implicit_euler,
+            model.particle_count,
+            [model.particle_inv_mass, state.f, model.real(self.scene.dt)],
+            [state.x, state.v],
+        )
+
+    def _add_forces(self) -> None:
+        """Overwrite the forces with those at the current positions and velocities."""
+        model, state = self.model, self.state
+        on_cpu = self.device == "cpu"
+        self._launch(fields.set_gravity_forces, model.particle_count, [model.particle_mass, model.gravity], [state.f])
+        spring_arrays = [model.spans, model.spring_classes, state.x, state.v]
+        if on_cpu:
+            self._launch(springs.add_span_forces, len(model.spans), spring_arrays, [state.f])
+        else:
+            self._launch(springs.add_spring_forces, (len(model.spans), springs.MAX_SPAN), spring_arrays, [state.f])
+        if len(model.colliders.kind) == 0:
+            return
+        chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else 32
+        self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], [self._lower, self._upper])
+        self._launch(
+            contacts.add_contact_forces,
+            (chunk_count, lanes),
+            [
+                *(model.chunk_start, model.chunk_body, model.colliders),
+                *(self._lower, self._upper, state.x, state.v),
+                *(self.scene.solver.culling, lanes),
+            ],
+            [state.f],
+        )
