@@ -2,8 +2,8 @@
 
 A cell is inside a closed mesh when the ray from its centre towards -x crosses the surface an odd number of times. Each
 triangle toggles one bit per column of cells that it covers: the first cell whose centre lies beyond the crossing, or
-the extra bit after the last cell. A prefix XOR along the columns then gives the parity of every cell, and the parity of the
-extra bit says whether the surface is closed there.
+the extra bit after the last cell. A prefix XOR along the columns then gives the parity of every cell, and the parity of
+the extra bit says whether the surface is closed there.
 
 Centres that lie exactly on an edge, a vertex or a face count as shifted by (e, e^2, e^3) for a vanishing e > 0, so that
 neighbouring triangles never both count a column, nor both miss it. Edges are tested in integers, hence exactly.
@@ -15,6 +15,16 @@ wp.set_module_options({"enable_backward": False})
 
 # Vertices are snapped to this fraction of a cell. At 4096 cells an edge function stays within 2 (2^12 2^18)^2 = 2^61.
 SUBCELLS = 1 << 18
+
+
+@wp.func
+def _twice_area(triangles: wp.array3d(dtype=wp.int64), t: int, b: int, c: int):
+    """Return twice the area of a triangle in the y-z plane, signed by the sense of its corners 0, b, c."""
+    by = triangles[t, b, 1] - triangles[t, 0, 1]
+    bz = triangles[t, b, 2] - triangles[t, 0, 2]
+    cy = triangles[t, c, 1] - triangles[t, 0, 1]
+    cz = triangles[t, c, 2] - triangles[t, 0, 2]
+    return by * cz - bz * cy
 
 
 @wp.func
@@ -42,25 +52,21 @@ def toggle_crossings(
     The bits are [y, z, x / 32], x from 0 to shape[0].
     """
     t = wp.tid()
-    ax, ay, az = triangles[t, 0, 0], triangles[t, 0, 1], triangles[t, 0, 2]
-    bx, by, bz = triangles[t, 1, 0], triangles[t, 1, 1], triangles[t, 1, 2]
-    cx, cy, cz = triangles[t, 2, 0], triangles[t, 2, 1], triangles[t, 2, 2]
-    area = (by - ay) * (cz - az) - (bz - az) * (cy - ay)
+    # Seen along x, the corners have to go round counter-clockwise.
+    b = 1
+    c = 2
+    area = _twice_area(triangles, t, b, c)
     if area == wp.int64(0):
         return
     if area < wp.int64(0):
-        swap = bx
-        bx = cx
-        cx = swap
-        swap = by
-        by = cy
-        cy = swap
-        swap = bz
-        bz = cz
-        cz = swap
         area = -area
+        b = 2
+        c = 1
+    ax, ay, az = triangles[t, 0, 0], triangles[t, 0, 1], triangles[t, 0, 2]
+    bx, by, bz = triangles[t, b, 0], triangles[t, b, 1], triangles[t, b, 2]
+    cx, cy, cz = triangles[t, c, 0], triangles[t, c, 1], triangles[t, c, 2]
     cell = wp.int64(SUBCELLS)
-    half = wp.int64(SUBCELLS // 2)
+    half = cell / wp.int64(2)
     # Columns whose centre lies between the least and the greatest coordinate.
     first_y = wp.max(wp.int64(0), (wp.min(ay, wp.min(by, cy)) - half) / cell)
     last_y = wp.min(wp.int64(shape[1] - 1), (wp.max(ay, wp.max(by, cy)) + half) / cell)

@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 
 from warpjelly.scene import Scene
-from warpjelly.usd import StageWriter, SurfaceFrame, SurfaceMesh
+from warpjelly.surface import SurfaceFrame, SurfaceMesh
+from warpjelly.usd import StageWriter
 
 
-def cube_surface(body: str = "cube", count: int = 5, center: tuple[float, float, float] = (0.0, 1.0, 0.0)) -> SurfaceMesh:
+def cube_surface(
+    body: str = "cube", count: int = 5, center: tuple[float, float, float] = (0.0, 1.0, 0.0)
+) -> SurfaceMesh:
     """Return the skin of a cube of edge 1 m with ``count`` points along an edge."""
     axis = np.linspace(-0.5, 0.5, count)
     lattice = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -44,7 +47,8 @@ def moved_surface(mesh: SurfaceMesh, frame: int, up: int = 1) -> SurfaceFrame:
     points[:, (up + 1) % 3] += np.float32(0.07 * frame)
     height = points[:, up] - points[:, up].min()
     velocities = np.tile(np.float32([0.1, -0.2, 0.3]) * frame, (len(points), 1))
-    forces = (frame * (1.5 - height) + 0.5).astype(np.float32)
+    # Different at every point, so that percentiles differ from the least and the greatest.
+    forces = (frame * (1.5 - height) + 0.5 + mesh.points @ [0.1, 0.05, 0.02]).astype(np.float32)
     return SurfaceFrame(points=points, normals=mesh.normals, velocities=velocities, forces=forces)
 
 
@@ -60,7 +64,9 @@ def make_scene(**changes: Any) -> Scene:
     return Scene.model_validate({**data, **changes})
 
 
-def write_stage(path: Path, scene: Scene | None = None, frames: int = 10, meshes: list[SurfaceMesh] | None = None) -> Path:
+def write_stage(
+    path: Path, scene: Scene | None = None, frames: int = 10, meshes: list[SurfaceMesh] | None = None
+) -> Path:
     """Write a stage of the synthetic motion and return its path."""
     scene = scene or make_scene()
     center = (0.0, 0.5, 0.0) if scene.up_axis == "Y" else (0.0, 0.0, 0.5)

@@ -46,11 +46,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_declared_packages_are_the_folders_on_disk() -> None:
     """Declare every folder of Python files below `warpjelly` and `kernels`, and no other."""
-    found = {
-        path.parent.relative_to(ROOT)
-        for name in ("warpjelly", "kernels")
-        for path in (ROOT / name).rglob("*.py")
-    }
+    found = {path.parent.relative_to(ROOT) for name in ("warpjelly", "kernels") for path in (ROOT / name).rglob("*.py")}
     declared = PYPROJECT["tool"]["setuptools"]
     assert {Path(folder) for folder in declared["package-dir"].values()} == found
     assert sorted(declared["packages"]) == sorted(declared["package-dir"])

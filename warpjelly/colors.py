@@ -1,6 +1,6 @@
 """The force colour map: raspberry jelly at rest, glowing through orange to yellow where the forces are.
 
-Eleven anchors of Matplotlib's plasma (CC0; by Nathaniel Smith and Stéfan van der Walt), its part from 6/16 to 1,
+Ten anchors of Matplotlib's plasma (CC0; by Nathaniel Smith and Stéfan van der Walt), its part from 7/16 to 1,
 interpolated to 256 entries. Lightness rises evenly along it, so it also reads in grey and with colour blindness.
 """
 
@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
-COLOR_MAP = "plasma (upper 5/8)"
+COLOR_MAP = "plasma (upper 9/16)"
 COLOR_COUNT = 256
 
-_ANCHORS = "aa2395 bc3587 cc4778 da5a6a e66c5c f0804e f89540 fdac33 fdc527 f8df25 f0f921"
+_ANCHORS = "bc3587 cc4778 da5a6a e66c5c f0804e f89540 fdac33 fdc527 f8df25 f0f921"
 
 
 def linear_from_srgb(srgb: np.ndarray) -> np.ndarray:

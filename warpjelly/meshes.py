@@ -22,7 +22,7 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
     if path.suffix.lower() not in EXTENSIONS:
         raise InputError(f"{path}: unknown mesh format '{path.suffix}'; known: {' '.join(EXTENSIONS)}")
     try:
-        mesh = trimesh.load_mesh(path)
+        mesh = trimesh.load_mesh(path, process=False)
     except OSError as error:
         raise InputError(f"{path}: cannot read the mesh: {error.strerror or error}") from error
     # The readers raise whatever their parsing happens to trip over; all of it means that the file is broken.
@@ -35,4 +35,6 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         raise InputError(f"{path}: the mesh has coordinates that are not finite numbers")
     if not np.ptp(used.reshape(-1, 3), axis=0).max() > 0:
         raise InputError(f"{path}: the mesh has no size; all its vertices coincide")
+    # Formats that repeat the vertices of every triangle would never be watertight otherwise.
+    mesh.merge_vertices(merge_tex=True, merge_norm=True)
     return mesh

@@ -87,8 +87,8 @@ class Solver(Table):
 class SpringConstants(Table):
     """Stiffness and damping of one kind of spring, in the units of the material's law."""
 
-    stiffness: NotNegative = Field(400.0, description="N with law strain, N/m with law hooke")
-    damping: NotNegative = Field(0.6, description="N s with law strain, N s/m with law hooke")
+    stiffness: NotNegative = Field(100.0, description="N with law strain, N/m with law hooke")
+    damping: NotNegative = Field(0.05, description="N s with law strain, N s/m with law hooke")
 
 
 class Material(Table):
@@ -402,13 +402,14 @@ class Scene(Table):
         return np.array(self.gravity) if self.gravity is not None else -9.81 * np.eye(3)[self.up]
 
 
-def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) -> Scene:
+def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, frames: int | None = None) -> Scene:
     """Read and validate a scene file.
 
     Args:
         path: TOML file.
         overrides: values by dotted key, for example ``{"solver.dt": 5e-4, "bodies.0.size": 2.0}``; an entry of a list
             goes by its number or its name.
+        frames: number of samples, instead of the scene's frames or duration.
 
     Raises:
         InputError: the file cannot be read, is not TOML, or is not a scene; the message names file, key and value.
@@ -424,6 +425,9 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None) 
         raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
     for key, value in (overrides or {}).items():
         _override(data, key, value)
+    if frames is not None:
+        data.pop("duration", None)
+        data["frames"] = frames
     data.setdefault("name", _identifier(path.stem))
     try:
         return Scene.model_validate(data, context={"folder": path.parent})

@@ -87,11 +87,19 @@ class Simulator:
         """Masses, [particle_count], kg; a copy."""
         return self.model.particle_mass.numpy().copy()
 
+    def prepare(self) -> None:
+        """Compile and capture what frames need, so that the first one takes no longer than the others."""
+        for substeps in set(self._blocks(self.scene.substeps)):
+            self._graph(substeps)
+
     def step(self, count: int = 1) -> None:
         """Advance by a number of substeps."""
-        block = min(self.scene.substeps, MAX_CAPTURED_SUBSTEPS)
-        for substeps in [block] * (count // block) + [1] * (count % block):
-            self._replay(substeps)
+        for substeps in self._blocks(count):
+            if (graph := self._graph(substeps)) is not None:
+                wp.capture_launch(graph)
+            else:
+                for _ in range(substeps):
+                    self._substep()
         self.substep_count += count
 
     def advance_frame(self) -> None:
@@ -118,6 +126,12 @@ class Simulator:
         first = int(self._non_finite.numpy()[0])
         return first if first < self.model.particle_count else None
 
+    def penetrations(self) -> np.ndarray:
+        """Return the greatest depth of a particle of each body in a collider, [body_count], m."""
+        depths = np.zeros(len(self.model.bodies))
+        np.maximum.at(depths, self.model.chunk_body.numpy(), self._measure_chunks()[:, diagnostics.DEPTH])
+        return depths
+
     def diagnostics(self) -> dict[str, Any]:
         """Measure the current state.
 
@@ -134,21 +148,7 @@ class Simulator:
             [model.spans, model.spring_classes, state.x],
             [self._elastic],
         )
-        self._launch(
-            diagnostics.measure_chunks,
-            len(model.chunk_body),
-            [
-                model.particle_mass,
-                model.gravity,
-                model.chunk_start,
-                model.chunk_body,
-                model.colliders,
-                state.x,
-                state.v,
-            ],
-            [self._sums],
-        )
-        sums = self._sums.numpy()
+        sums = self._measure_chunks()
         total, greatest = sums.sum(axis=0), sums.max(axis=0)
         return {
             "kinetic": float(total[diagnostics.KINETIC]),
@@ -196,15 +196,35 @@ class Simulator:
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
-    def _replay(self, substeps: int) -> None:
-        """Run substeps as one captured graph, or as plain launches where graphs cannot be captured."""
+    def _measure_chunks(self) -> np.ndarray:
+        """Return the sums over each chunk, float64 [chunk_count, diagnostics.COLUMNS]; a view that is overwritten."""
+        model, state = self.model, self.state
+        self._launch(
+            diagnostics.measure_chunks,
+            len(model.chunk_body),
+            [
+                model.particle_mass,
+                model.gravity,
+                model.chunk_start,
+                model.chunk_body,
+                model.colliders,
+                state.x,
+                state.v,
+            ],
+            [self._sums],
+        )
+        return self._sums.numpy()
+
+    def _blocks(self, count: int) -> list[int]:
+        """Cut a number of substeps into those that graphs are captured for: a frame, or a large part of it, and one."""
+        block = min(self.scene.substeps, MAX_CAPTURED_SUBSTEPS)
+        return [block] * (count // block) + [1] * (count % block)
+
+    def _graph(self, substeps: int) -> Any:
+        """Return the captured graph of some substeps, None where the device cannot capture."""
         if self._capturable and substeps not in self._graphs:
             self._graphs[substeps] = self._capture(substeps)
-        if self._capturable:
-            wp.capture_launch(self._graphs[substeps])
-        else:
-            for _ in range(substeps):
-                self._substep()
+        return self._graphs[substeps] if self._capturable else None
 
     def _capture(self, substeps: int) -> Any:
         with _capture_lock:

@@ -12,7 +12,6 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +20,7 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 from .colors import COLOR_MAP, LINEAR_TABLE, color_indices
 from .errors import EnvironmentFailedError, InputError
 from .scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider
+from .surface import SurfaceFrame, SurfaceMesh
 
 STAGE_NAME = "stage.usdc"
 
@@ -31,7 +31,8 @@ _LOOKS = _WORLD.AppendChild("looks")
 _LIGHTS = _WORLD.AppendChild("lights")
 _CAMERA = _WORLD.AppendChild("camera")
 
-# The camera: a 50 mm lens on a 36 mm wide 16:9 film back, looking slightly down from the right (directions are for Y up).
+# The camera has a 50 mm lens and a 36 mm wide 16:9 film back, and looks slightly down from the right. Directions are
+# for Y up.
 _FOCAL_LENGTH, _APERTURE = 50.0, (36.0, 20.25)
 _CAMERA_DIRECTION = (0.6, 0.45, 1.0)
 # Share of the frame that the motion may fill, from the centre to the edge.
@@ -42,36 +43,8 @@ _FILL_DIRECTION = (1.0, 0.4, 0.3)
 _COLLIDER_GREY = 0.4
 # Edge of the square that stands for an infinite wall, in diagonals of the motion.
 _WALL_SIZE = 20.0
-# Forces that vary by less than this share of their value are one force and rounding, not a range to stretch colours over.
+# Forces that vary by less than this share of their value are one force and rounding: no range to stretch colours over.
 _FLAT_RANGE = 1e-2
-
-
-@dataclass(frozen=True)
-class SurfaceMesh:
-    """What stays the same of a body's surface over a run."""
-
-    body: str
-    """Name of the body."""
-    points: np.ndarray
-    """Rest positions, float32 [point_count, 3], m."""
-    normals: np.ndarray
-    """Rest normals, unit length, float32 [point_count, 3]."""
-    quads: np.ndarray
-    """Corners of the faces in ``points``, counter-clockwise from outside, int32 [face_count, 4]."""
-
-
-@dataclass(frozen=True)
-class SurfaceFrame:
-    """One body's surface at one sample."""
-
-    points: np.ndarray
-    """Positions, float32 [point_count, 3], m."""
-    normals: np.ndarray
-    """Normals, unit length, float32 [point_count, 3]."""
-    velocities: np.ndarray
-    """Velocities, float32 [point_count, 3], m/s."""
-    forces: np.ndarray
-    """Force magnitudes, float32 [point_count], N."""
 
 
 class StageWriter:
@@ -157,7 +130,9 @@ class StageWriter:
         _export(self._layer, self._path)
         self._closed = True
 
-    def _author_colors(self, index: int, mesh: SurfaceMesh, forces: np.ndarray, force_range: tuple[float, float]) -> None:
+    def _author_colors(
+        self, index: int, mesh: SurfaceMesh, forces: np.ndarray, force_range: tuple[float, float]
+    ) -> None:
         indices = color_indices(forces, force_range)
         primvar = _surface_path(mesh).AppendProperty("primvars:displayColor")
         if self._scene.output.color == "rgb":
@@ -260,7 +235,10 @@ def _define_lights(stage: Usd.Stage, scene: Scene) -> None:
     UsdGeom.Xform.Define(stage, _LIGHTS)
     dome = UsdLux.DomeLight.Define(stage, _LIGHTS.AppendChild("sky"))
     dome.CreateIntensityAttr(0.5)
-    for name, direction, intensity, angle in (("key", _KEY_DIRECTION, 2.0, 6.0), ("fill", _FILL_DIRECTION, 0.4, 30.0)):
+    for name, direction, intensity, angle in (
+        ("key", _KEY_DIRECTION, 2.0, 6.0),
+        ("fill", _FILL_DIRECTION, 0.4, 30.0),
+    ):
         light = UsdLux.DistantLight.Define(stage, _LIGHTS.AppendChild(name))
         light.CreateIntensityAttr(intensity)
         light.CreateAngleAttr(angle)
@@ -307,7 +285,7 @@ def _bind(shape: UsdGeom.Gprim, look: str) -> None:
 
 
 def _define_colliders(stage: Usd.Stage, scene: Scene, bounds: np.ndarray, rest_center: np.ndarray) -> None:
-    """Draw what the bodies collide with; infinite walls reach well around the motion, ``bounds`` [2, 3], m."""
+    """Draw what the bodies collide with; infinite walls reach well around the motion, bounds [2, 3], m."""
     UsdGeom.Xform.Define(stage, _COLLIDERS)
     diagonal = _diagonal(bounds)
     for collider in scene.colliders:
@@ -316,7 +294,8 @@ def _define_colliders(stage: Usd.Stage, scene: Scene, bounds: np.ndarray, rest_c
         if isinstance(collider, PlaneCollider):
             shape = _define_rectangle(stage, path, np.array(collider.center), collider.frame(), collider.size)
         elif isinstance(collider, HalfSpaceCollider):
-            tangent, bitangent, normal = PlaneCollider(type="plane", normal=collider.normal, size=(1.0, 1.0)).frame()
+            part = PlaneCollider(type="plane", normal=collider.normal, size=(1.0, 1.0))
+            tangent, bitangent, normal = part.frame()
             if (rest_center - collider.center) @ normal < 0:
                 # Seen from behind, a wall is culled: its front has to face the bodies.
                 tangent, bitangent, normal = bitangent, tangent, -normal
@@ -366,18 +345,19 @@ def _define_edges(stage: Usd.Stage, path: Sdf.Path, box: BoxCollider, *, width: 
 
 
 def _define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:
-    """Place a camera that sees the whole motion, ``bounds`` [2, 3], m, and the balls close to it."""
+    """Place a camera that sees the whole motion, bounds [2, 3], m, and the balls close to it."""
     diagonal = _diagonal(bounds)
     low, high = bounds.copy()
     for collider in scene.colliders:
         if isinstance(collider, SphereCollider) and collider.radius < diagonal:
             center = np.array(collider.center)
             if np.linalg.norm(center - np.clip(center, *bounds)) < collider.radius + diagonal / 2:
-                low, high = np.minimum(low, center - collider.radius), np.maximum(high, center + collider.radius)
+                low = np.minimum(low, center - collider.radius)
+                high = np.maximum(high, center + collider.radius)
     axes = _facing(_CAMERA_DIRECTION, scene)
     x, y, z = axes @ np.array(list(np.ndindex(2, 2, 2)) * (high - low) + low).T
-    # A corner is seen from (X, Y, Z), in the axes of the camera, while |x - X| <= s (Z - z), s being the slope of the
-    # frustum's sides; the closest place at which all are seen follows from the outermost corner on each side.
+    # In the axes of the camera, a corner is seen from (X, Y, Z) while |x - X| <= s (Z - z), with s the slope of the
+    # frustum's sides; the closest place that sees all follows from the outermost corner on each side.
     placed = []
     for across, aperture in ((x, _APERTURE[0]), (y, _APERTURE[1])):
         slope = _FRAME_FILL * aperture / (2 * _FOCAL_LENGTH)
@@ -400,7 +380,7 @@ def _diagonal(bounds: np.ndarray) -> float:
 
 
 def _facing(direction: tuple[float, float, float], scene: Scene) -> np.ndarray:
-    """Return the axes (right, up, backward) [3, 3] of a camera or light that looks from a direction, given for Y up."""
+    """Return the axes (right, up, backward) [3, 3] of a camera or light that looks from a direction."""
     x, y, z = direction
     backward = np.array([x, y, z] if scene.up_axis == "Y" else [x, -z, y])
     backward /= np.linalg.norm(backward)

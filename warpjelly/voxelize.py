@@ -9,6 +9,8 @@ import warp as wp
 
 from warpjelly.kernels import voxels
 
+from .device import start_warp
+
 
 @dataclass(frozen=True)
 class VoxelGrid:
@@ -35,6 +37,7 @@ def voxelize(triangles: np.ndarray, resolution: int, *, device: str = "cpu") -> 
         resolution: cells along the longest edge, 1 to 4096.
         device: where to scan-convert.
     """
+    start_warp()
     lower, upper = triangles.min(axis=(0, 1)).astype(float), triangles.max(axis=(0, 1)).astype(float)
     cell_size = float((upper - lower).max()) / resolution
     # The cubic grid less the layers on both sides that the mesh does not reach.

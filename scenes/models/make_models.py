@@ -39,9 +39,7 @@ def tree() -> Manifold:
 def coupler() -> Manifold:
     """Return an elastic shaft coupler along the y axis: a tube whose middle is cut into a helical beam."""
     tube = Manifold.cylinder(COUPLER_LENGTH, COUPLER_RADIUS, circular_segments=COUPLER_SEGMENTS, center=True)
-    bore = Manifold.cylinder(
-        2 * COUPLER_LENGTH, COUPLER_BORE, circular_segments=COUPLER_SEGMENTS, center=True
-    )
+    bore = Manifold.cylinder(2 * COUPLER_LENGTH, COUPLER_BORE, circular_segments=COUPLER_SEGMENTS, center=True)
 
     def wind(point: tuple[float, float, float]) -> tuple[float, float, float]:
         radius, offset, turns = point

@@ -1,0 +1,42 @@
+"""Fixtures and the home of the ``egl`` marker."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import os
+
+import pytest
+import warp as wp
+
+from warpjelly.device import start_warp
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run a test that asks for a device on the CPU and, where there is one, on the first GPU."""
+    if "device" in metafunc.fixturenames:
+        start_warp()
+        metafunc.parametrize("device", ["cpu", "cuda:0"] if wp.is_cuda_available() else ["cpu"])
+
+
+@pytest.fixture(params=["float32", "float64"])
+def precision(request: pytest.FixtureRequest) -> str:
+    """Return the floating-point type of the simulation."""
+    return request.param
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Skip tests marked ``egl`` where offscreen OpenGL is missing, unless WARPJELLY_REQUIRE_EGL=1 forbids it."""
+    marked = [item for item in items if item.get_closest_marker("egl")]
+    if not marked or os.environ.get("WARPJELLY_REQUIRE_EGL") == "1" or _has_egl():
+        return
+    for item in marked:
+        item.add_marker(pytest.mark.skip(reason="no offscreen OpenGL: libEGL cannot be loaded"))
+
+
+def _has_egl() -> bool:
+    try:
+        ctypes.CDLL(ctypes.util.find_library("EGL") or "libEGL.so.1")
+    except OSError:
+        return False
+    return True

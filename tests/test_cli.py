@@ -1,0 +1,350 @@
+import csv
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pxr import Usd, UsdGeom
+
+import warpjelly as wj
+from warpjelly import cli, plan
+
+SCENES = Path(__file__).parent.parent / "scenes"
+CUBE = str(SCENES / "jello_cube.toml")
+
+MODEL_SCENE = """
+[materials.m]
+[[bodies]]
+type = "model"
+material = "m"
+file = "FILE"
+resolution = 4
+"""
+
+
+@pytest.fixture
+def warpjelly(monkeypatch, capfd):
+    """Return a function that runs a command line and gives exit code, stdout and stderr."""
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", ["warpjelly", *map(str, arguments)])
+        capfd.readouterr()
+        with pytest.raises(SystemExit) as exit_code:
+            cli.main()
+        captured = capfd.readouterr()
+        return int(exit_code.value.code or 0), captured.out, captured.err
+
+    return call
+
+
+def one_line(stderr: str) -> str:
+    """Return the only line of an error."""
+    lines = stderr.strip().splitlines()
+    assert len(lines) == 1, stderr
+    assert lines[0].startswith("error: ")
+    return lines[0]
+
+
+def test_run_writes_the_run_directory(warpjelly, tmp_path):
+    """Run a scene and hold the JSON, the record, the metrics and the stage against each other."""
+    code, out, err = warpjelly("run", CUBE, "--frames", 5, "-o", tmp_path / "a", "--json", "--device", "cpu")
+    assert (code, err) == (0, "")
+    record = json.loads(out)
+    assert record.items() >= {"scene": "jello_cube", "frames": 5, "fps": 60.0, "particles": 512}.items()
+    assert record.items() >= {"springs": 6220, "voxels": 1, "substeps": 34, "device": "cpu"}.items()
+    assert record.items() >= {"precision": "float32", "diverged": False, "dt": 1 / (60 * 34)}.items()
+    assert record["wall_seconds"] > 0
+    assert record["springs_per_second"] > 0
+    assert record["stage"] == str(tmp_path / "a" / "stage.usdc")
+    assert record["run_dir"] == str(tmp_path / "a")
+    assert json.loads((tmp_path / "a" / "run.json").read_text()) == record
+    assert sorted(os.listdir(tmp_path / "a")) == ["metrics.csv", "run.json", "stage.usdc"]
+    with open(tmp_path / "a" / "metrics.csv", newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert [int(row["frame"]) for row in rows] == [0, 1, 2, 3, 4]
+    assert float(rows[4]["time"]) == pytest.approx(4 / 60)
+    # Free fall: the velocity g t is exact in the scheme, and so is the kinetic energy of the 5.12 kg, but for rounding.
+    assert float(rows[4]["kinetic"]) == pytest.approx(5.12 * (9.81 * 4 / 60) ** 2 / 2, rel=1e-4)
+
+
+def test_run_and_the_python_interface_agree(warpjelly, tmp_path):
+    """Write the same points as a Simulator driven by hand computes."""
+    assert warpjelly("run", CUBE, "--frames", 3, "-o", tmp_path / "a", "--device", "cpu", "--quiet") == (0, "", "")
+    sim = wj.Simulator(wj.load_scene(CUBE, frames=3), device="cpu")
+    stage = Usd.Stage.Open(str(tmp_path / "a" / "stage.usdc"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/bodies/cube/surface"))
+    for frame in range(3):
+        if frame:
+            sim.advance_frame()
+        surface = sim.positions[sim.model.surface_particles.numpy()]
+        np.testing.assert_array_equal(np.asarray(mesh.GetPointsAttr().Get(frame)), surface)
+    assert stage.GetEndTimeCode() == 2
+
+
+def test_the_stage_of_every_scene_is_sound(warpjelly, tmp_path):
+    """Run each scene for a moment and validate its stage."""
+    for path in sorted(SCENES.glob("*.toml")):
+        assert warpjelly("run", path, "--frames", 4, "-o", tmp_path / path.stem)[0] == 0
+        code, out, err = warpjelly("validate", tmp_path / path.stem)
+        assert (code, err) == (0, "")
+        assert out.endswith("sound\n")
+
+
+def test_validate_lists_every_problem_and_exits_with_1(warpjelly, tmp_path):
+    """Break a stage in two ways and find both."""
+    warpjelly("run", CUBE, "--frames", 3, "-o", tmp_path, "--quiet")
+    stage = Usd.Stage.Open(str(tmp_path / "stage.usdc"))
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/bodies/cube/surface"))
+    points = np.array(mesh.GetPointsAttr().Get(1))
+    points[0] = np.nan
+    mesh.GetPointsAttr().Set(points, 1)
+    stage.DefinePrim("/Elsewhere")
+    stage.Save()
+    code, out, _ = warpjelly("validate", tmp_path)
+    assert code == 1
+    assert "non-finite" in out
+    assert "/Elsewhere" in out
+
+
+def test_check_counts_what_run_builds(warpjelly):
+    """Compare the figures of check with those of a run."""
+    code, out, err = warpjelly("check", CUBE, "--json")
+    assert (code, err) == (0, "")
+    figures = json.loads(out)
+    assert figures.items() >= {"particles": 512, "springs": 6220, "voxels": 1, "substeps": 34}.items()
+    assert figures["memory_bytes"] > 0
+    assert figures["seconds"] > 0
+    code, out, _ = warpjelly("check", CUBE, "--set", "bodies.cube.particles_per_edge=5")
+    assert code == 0
+    assert "125" in out
+
+
+def test_a_finished_run_is_kept_unless_forced(warpjelly, tmp_path):
+    """Refuse to overwrite, and replace when told to."""
+    assert warpjelly("run", CUBE, "--frames", 2, "-o", tmp_path)[0] == 0
+    before = (tmp_path / "stage.usdc").read_bytes()
+    code, _, err = warpjelly("run", CUBE, "--frames", 3, "-o", tmp_path)
+    assert code == 2
+    assert "--force" in one_line(err)
+    assert (tmp_path / "stage.usdc").read_bytes() == before
+    assert warpjelly("run", CUBE, "--frames", 3, "-o", tmp_path, "--force")[0] == 0
+    assert Usd.Stage.Open(str(tmp_path / "stage.usdc")).GetEndTimeCode() == 2
+
+
+def test_a_refused_scene_leaves_a_finished_run_alone(warpjelly, tmp_path):
+    """Build before replacing anything, so that a typing error with --force costs nothing."""
+    warpjelly("run", CUBE, "--frames", 2, "-o", tmp_path)
+    before = (tmp_path / "stage.usdc").read_bytes()
+    code, *_ = warpjelly("run", CUBE, "--force", "-o", tmp_path, "--set", "bodies.cube.particles_per_edge=4096")
+    assert code == 2
+    assert (tmp_path / "stage.usdc").read_bytes() == before
+
+
+def test_a_run_that_diverges_keeps_what_came_before(warpjelly, tmp_path):
+    """Exit with 3, name the particle, and leave a sound stage of the finite frames."""
+    code, out, err = warpjelly("run", CUBE, "-o", tmp_path, "--json", "--set", "materials.jelly.shear.damping=5.0")
+    assert code == 3
+    assert "particle" in one_line(err)
+    assert "'cube'" in err
+    record = json.loads(out)
+    assert record["diverged"] is True
+    assert 1 <= record["frames"] < 300
+    assert warpjelly("validate", tmp_path)[0] == 0
+    assert json.loads((tmp_path / "run.json").read_text()) == record
+
+
+def test_an_interrupted_run_keeps_its_frames(warpjelly, tmp_path, monkeypatch):
+    """Exit with 130 after Ctrl-C and leave a sound stage of the frames before."""
+    advance = wj.Simulator.advance_frame
+
+    def interrupted(sim: wj.Simulator) -> None:
+        if sim.substep_count >= 3 * sim.scene.substeps:
+            raise KeyboardInterrupt
+        advance(sim)
+
+    monkeypatch.setattr(wj.Simulator, "advance_frame", interrupted)
+    code, _, err = warpjelly("run", CUBE, "-o", tmp_path)
+    assert code == 130
+    assert "interrupted; the frames that were finished are in the run directory" in err
+    assert json.loads((tmp_path / "run.json").read_text())["frames"] == 4
+    assert warpjelly("validate", tmp_path)[0] == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["run"], "'scene'"),
+        (["run", "none.toml"], "none.toml"),
+        (["run", CUBE, "--frames", "0"], "--frames"),
+        (["run", CUBE, "--device", "cuda:9"], "cuda:9"),
+        (["run", CUBE, "--colour", "rgb"], "--colour"),
+        (["run", CUBE, "--set", "solver.dt"], "KEY=VALUE"),
+        (["run", CUBE, "--set", "solver.dt=-1"], "solver.dt = -1"),
+        (["run", CUBE, "--set", "bodies.cube.particles_per_edge=1000"], "GB of memory"),
+        (["run", CUBE, "--set", "bodies.cube.particles_per_edge=4096"], "indices"),
+        (["fly"], "fly"),
+        (["validate", "none.usdc"], "none.usdc"),
+        (["preview", "none.usdc", "-o", "a.png"], "none.usdc"),
+        (["preview", "none.usdc"], "output"),
+        (["preview", "none.usdc", "-o", "a.png", "--size", "big"], "--size big"),
+    ],
+)
+def test_wrong_arguments_exit_with_2_and_one_line(warpjelly, tmp_path, monkeypatch, arguments, said):
+    """Refuse wrong arguments without a traceback and without leaving anything behind."""
+    monkeypatch.chdir(tmp_path)
+    code, out, err = warpjelly(*arguments)
+    assert (code, out) == (2, "")
+    assert said in one_line(err)
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("empty.obj", b"", "no triangles"),
+        ("points.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\n", "no triangles"),
+        ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
+        ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
+        ("dot.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "dot.obj"),
+        ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no cell of the grid"),
+        ("noise.stl", bytes(range(256)), "noise.stl"),
+        ("words.stl", b"this is not a mesh", "words.stl"),
+        ("noise.glb", bytes(range(256)), "noise.glb"),
+        ("model.xyz", b"0 0 0\n", "unknown mesh format '.xyz'"),
+    ],
+)
+def test_an_unusable_model_exits_with_2_and_one_line(warpjelly, tmp_path, name, content, said):
+    """Refuse models without triangles, with broken numbers, or in no known format."""
+    (tmp_path / name).write_bytes(content)
+    scene = tmp_path / "scene.toml"
+    scene.write_text(MODEL_SCENE.replace("FILE", name))
+    code, out, err = warpjelly("run", scene, "-o", tmp_path / "out")
+    assert (code, out) == (2, "")
+    errors = [line for line in err.splitlines() if not line.startswith("warning: ")]
+    assert said in one_line("\n".join(errors))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_scene_that_cannot_fit_is_refused_with_the_numbers(warpjelly, tmp_path, monkeypatch):
+    """Estimate before allocating: the message has what is needed and what there is."""
+    monkeypatch.setattr(plan, "memory_limit", lambda: 1e9)
+    code, _, err = warpjelly("check", CUBE, "--set", "bodies.cube.particles_per_edge=300")
+    assert code == 2
+    assert "27,000,000 particles" in err
+    assert "of 1.0 GB" in one_line(err)
+    code, _, err = warpjelly("check", SCENES / "tree_drop.toml", "--set", "bodies.tree.resolution=4096")
+    assert code == 2
+    assert "a grid of" in one_line(err)
+
+
+@pytest.mark.parametrize("output", ["file", "file/below"])
+def test_an_output_that_cannot_be_written_exits_with_4(warpjelly, tmp_path, output):
+    """Say in one line which folder cannot be written."""
+    (tmp_path / "file").write_text("")
+    code, out, err = warpjelly("run", CUBE, "--frames", 2, "-o", tmp_path / output)
+    assert (code, out) == (4, "")
+    assert str(tmp_path / output) in one_line(err)
+    assert (tmp_path / "file").read_text() == ""
+
+
+def test_a_full_disk_exits_with_4(tmp_path):
+    """Limit the size of files and require one clear line and no half stage."""
+    script = (
+        "import resource, signal, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (50_000, 50_000));"
+        "from warpjelly import cli; cli.main()"
+    )
+    environment = os.environ | {"PYTHONDONTWRITEBYTECODE": "1"}
+    arguments = ["run", CUBE, "--frames", "30", "-o", str(tmp_path / "out"), "--device", "cpu"]
+    done = subprocess.run(
+        [sys.executable, "-c", script, *arguments], capture_output=True, text=True, env=environment, check=False
+    )
+    assert done.returncode == 4, done.stderr
+    assert str(tmp_path / "out") in one_line(done.stderr)
+    assert not (tmp_path / "out" / "stage.usdc").exists()
+    assert not (tmp_path / "out" / "run.json").exists()
+
+
+def test_an_open_mesh_is_used_with_a_warning(warpjelly, tmp_path):
+    """Warn of a mesh that is not watertight, and go on."""
+    faces = ["1 3 2", "2 3 4", "5 6 7", "6 8 7", "1 2 5", "2 6 5", "3 7 4", "4 7 8", "1 5 3", "3 5 7"]
+    vertices = [f"v {x} {y} {z}" for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    (tmp_path / "open.obj").write_text("\n".join([*vertices, *(f"f {face}" for face in faces)]))
+    scene = tmp_path / "scene.toml"
+    scene.write_text(MODEL_SCENE.replace("FILE", "open.obj"))
+    code, _, err = warpjelly("check", scene)
+    assert err.startswith("warning: ")
+    assert "not watertight; 16 of its 16 columns" in err
+    assert code in (0, 2)
+
+
+def test_a_body_that_starts_in_a_collider_is_warned_of(warpjelly, tmp_path):
+    """Warn of the depth at the start, and go on."""
+    arguments = ["--frames", 2, "-o", tmp_path, "--set", "bodies.cube.position=[0.0, 0.3, 0.0]"]
+    code, _, err = warpjelly("run", CUBE, *arguments, "--set", "bodies.cube.rotation=[0.0, 0.0, 0.0]")
+    assert code == 0
+    assert "warning: body 'cube' starts 0.2 m deep in a collider" in err
+
+
+def test_paths_with_spaces_and_other_letters_work(warpjelly, tmp_path):
+    """Write to and read from a folder with spaces and non-ASCII letters."""
+    folder = tmp_path / "süße Würfel 方"
+    assert warpjelly("run", CUBE, "--frames", 2, "-o", folder)[0] == 0
+    assert warpjelly("validate", folder)[0] == 0
+
+
+def test_rgb_colours_are_stored_on_request(warpjelly, tmp_path):
+    """Store plain colours per point with --color rgb, and indices without."""
+    for option, indexed in (("rgb", False), ("indexed", True)):
+        warpjelly("run", CUBE, "--frames", 2, "-o", tmp_path / option, "--color", option)
+        stage = Usd.Stage.Open(str(tmp_path / option / "stage.usdc"))
+        mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/bodies/cube/surface"))
+        assert UsdGeom.Primvar(mesh.GetDisplayColorAttr()).IsIndexed() is indexed
+
+
+def test_doctor_names_versions_devices_and_extras(warpjelly):
+    """Show what is there, and what a missing extra is called."""
+    code, out, err = warpjelly("doctor")
+    assert (code, err) == (0, "")
+    for part in ("warpjelly", "warp-lang", "usd-core", "cpu", "preview", "memory"):
+        assert part in out
+
+
+def test_help_teaches_every_command(warpjelly):
+    """Show help for the program and each command, and the version."""
+    code, out, _ = warpjelly("--help")
+    assert code == 0
+    for command in ("run", "check", "validate", "preview", "doctor"):
+        assert command in out
+        assert warpjelly(command, "--help")[0] == 0
+    assert warpjelly("--version")[1].startswith("warpjelly ")
+
+
+def test_an_internal_error_says_where_to_report_it(warpjelly, monkeypatch):
+    """Turn an unexpected exception into one line and exit code 4."""
+
+    def fail(*arguments: object, **options: object) -> None:
+        raise ZeroDivisionError("by zero")
+
+    monkeypatch.setattr("warpjelly.scene.load_scene", fail)
+    code, _, err = warpjelly("check", CUBE)
+    assert code == 4
+    assert "internal error: ZeroDivisionError" in one_line(err)
+    assert "CONTRIBUTING.md" in err
+
+
+@pytest.mark.egl
+def test_preview_makes_a_picture_of_a_run(warpjelly, tmp_path):
+    """Render two frames of a real run side by side."""
+    warpjelly("run", CUBE, "--frames", 3, "-o", tmp_path / "run")
+    picture = tmp_path / "a.png"
+    code, out, _ = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 0, "--frame", 2, "--size", "64x48")
+    assert code == 0
+    assert str(picture) in out
+    assert picture.read_bytes().startswith(b"\x89PNG")
+    code, _, err = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 3)
+    assert code == 2
+    assert "0 to 2" in one_line(err)

@@ -1,0 +1,42 @@
+"""Scenes for tests, and simulators in a given state."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from warpjelly.scene import Scene
+from warpjelly.simulator import Simulator
+
+
+def make_material(stiffness: float = 400.0, damping: float = 0.6, **changes: Any) -> dict[str, Any]:
+    """Return a material with the same constants for every kind of spring."""
+    constants = {"stiffness": float(stiffness), "damping": float(damping)}
+    return {"structural": constants, "shear": constants, "bend": constants, **changes}
+
+
+def make_scene(*, solver: dict[str, Any] | None = None, **changes: Any) -> Scene:
+    """Return a scene of one cube of 8 particles in free flight at 1000 steps/s, with top-level keys replaced."""
+    data: dict[str, Any] = {
+        "name": "test",
+        "fps": 100.0,
+        "frames": 2,
+        "gravity": [0.0, 0.0, 0.0],
+        "materials": {"jelly": make_material()},
+        "bodies": [{"name": "cube", "type": "cube", "material": "jelly", "particles_per_edge": 2}],
+    }
+    return Scene.model_validate({**data, "solver": {"dt": 1e-3, "precision": "float64", **(solver or {})}, **changes})
+
+
+def make_voxels(cells: np.ndarray, **changes: Any) -> dict[str, Any]:
+    """Return a body of jelly cubes from occupied cells [x, y, z]."""
+    layers = [["".join(".#"[int(c)] for c in row) for row in layer] for layer in cells.transpose(1, 2, 0)]
+    return {"type": "voxels", "material": "jelly", "layers": layers, **changes}
+
+
+def set_state(simulator: Simulator, *, x: np.ndarray | None = None, v: np.ndarray | None = None) -> None:
+    """Put the particles elsewhere, [particle_count, 3] each."""
+    for rows, values in ((simulator.state.x, x), (simulator.state.v, v)):
+        if values is not None:
+            rows.assign(np.ascontiguousarray(np.asarray(values).T))

@@ -1,0 +1,307 @@
+"""The command line. Imports are inside the commands, so that ``--help`` answers at once."""
+
+from __future__ import annotations
+
+import json
+import logging
+import os
+import sys
+import tomllib
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from .errors import EnvironmentFailedError, InputError, WarpjellyError
+
+if TYPE_CHECKING:
+    from .expect import Outcome
+    from .scene import Scene
+
+app = typer.Typer(
+    help="Turn 3D models into jelly: a scene file in, an animated USD stage out.",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    epilog="Start with:  warpjelly run scenes/tree_drop.toml",
+)
+
+SceneArgument = Annotated[Path, typer.Argument(help="Scene file (.toml).", show_default=False)]
+SetOption = Annotated[
+    list[str],
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Change a key of the scene: --set solver.dt=5e-4 --set bodies.tree.resolution=20.",
+        show_default=False,
+    ),
+]
+DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu, cuda:0 ...; auto takes a GPU if there is one.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        from importlib.metadata import version
+
+        print(f"warpjelly {version('warpjelly')}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Show the version and exit.")
+    ] = False,
+) -> None: ...
+
+
+@app.command()
+def run(
+    scene: SceneArgument,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Run directory; outputs/<scene name> unless given.", show_default=False),
+    ] = None,
+    device: DeviceOption = "auto",
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Number of samples instead of the scene's.", show_default=False)
+    ] = None,
+    settings: SetOption = [],  # noqa: B006 -- typer wants a list and copies it
+    force: Annotated[bool, typer.Option("--force", help="Replace a run that is there already.")] = False,
+    color: Annotated[
+        Literal["indexed", "rgb"] | None,
+        typer.Option(help="How the stage stores force colours; rgb for readers without indices.", show_default=False),
+    ] = None,
+    as_json: JsonOption = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress and no summary.")] = False,
+) -> None:
+    """Simulate a scene and write its stage.
+
+    The run directory receives stage.usdc, metrics.csv (energies, momenta, contacts per frame) and run.json (all that is
+    needed to repeat the run).
+    """
+    overrides = _overrides(settings)
+    if color is not None:
+        overrides["output.color"] = color
+    loaded = _load(scene, overrides, frames)
+
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    with Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("frames  {task.fields[rate]}"),
+        TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=quiet or not sys.stderr.isatty(),
+        transient=True,
+    ) as bar:
+        task = bar.add_task("building", total=loaded.frame_count, rate="")
+
+        def show(done: int, total: int) -> None:
+            speed = bar.tasks[task].finished_speed or bar.tasks[task].speed
+            rate = f"{speed:.1f}/s" if speed else ""
+            bar.update(task, completed=done, description="simulating", rate=rate)
+
+        from .run import simulate
+
+        try:
+            result = simulate(loaded, output=output, device=device, force=force, progress=show)
+        except KeyboardInterrupt:
+            print("interrupted; the frames that were finished are in the run directory", file=sys.stderr)
+            raise
+    record = result.record
+    if as_json:
+        print(json.dumps(record))
+    elif not quiet:
+        _summarize(record, result.outcomes)
+    if result.error is not None:
+        raise result.error
+
+
+@app.command()
+def check(
+    scene: SceneArgument,
+    settings: SetOption = [],  # noqa: B006
+    device: DeviceOption = "auto",
+    as_json: JsonOption = False,
+) -> None:
+    """Validate a scene, count what it is made of, and estimate what a run takes."""
+    loaded = _load(scene, _overrides(settings), None)
+
+    from .run import forecast
+
+    figures = forecast(loaded, device=device)
+    if as_json:
+        print(json.dumps(figures))
+        return
+    print(f"{scene}: sound")
+    print(f"  voxels     {figures['voxels']:>13,}")
+    print(f"  particles  {figures['particles']:>13,}")
+    print(f"  springs    {figures['springs']:>13,}")
+    print(f"  memory     {figures['memory_bytes'] / 1e9:>13.2f} GB at the peak, about")
+    print(f"  step       {figures['dt'] * 1e3:>13.4g} ms, {figures['substeps']} a frame, {figures['frames']} frames")
+    print(f"  time       {figures['seconds']:>13.3g} s on {figures['device']}, about, stage included")
+
+
+@app.command()
+def validate(
+    stage: Annotated[Path, typer.Argument(help="Stage file or run directory.", show_default=False)],
+) -> None:
+    """Say whether a stage is sound: exit 0, or 1 with every problem listed."""
+    from .validate import stage_problems
+
+    problems = stage_problems(stage)
+    for problem in problems:
+        print(problem)
+    print(f"{stage}: {'sound' if not problems else f'{len(problems)} problem(s)'}")
+    if problems:
+        raise typer.Exit(1)
+
+
+@app.command()
+def preview(
+    source: Annotated[Path, typer.Argument(metavar="RUN_OR_STAGE", help="Run directory or stage.", show_default=False)],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write, .png.", show_default=False)],
+    frames: Annotated[
+        list[int],
+        typer.Option(
+            "--frame",
+            help="Frame to show; repeat it for several side by side. The moment of the hardest impact unless given.",
+            show_default=False,
+        ),
+    ] = [],  # noqa: B006
+    size: Annotated[str, typer.Option(metavar="WxH", help="Size of a frame in pixels.")] = "960x540",
+) -> None:
+    """Look at a result without a USD viewer."""
+    width, _, height = size.partition("x")
+    if not (width.isdigit() and height.isdigit()):
+        raise InputError(f"--size {size}: give width x height in pixels, for example 960x540")
+
+    from .preview import render_preview
+
+    render_preview(source, output, frames=frames or None, size=(int(width), int(height)))
+    print(f"picture: {output}")
+
+
+@app.command()
+def doctor() -> None:
+    """Show versions, devices, and which optional parts are present."""
+    import platform
+    from importlib import metadata, util
+
+    import warp as wp
+
+    from .device import start_warp
+    from .plan import memory_limit
+
+    start_warp()
+    print(f"warpjelly {metadata.version('warpjelly')} on Python {platform.python_version()}, {platform.platform()}")
+    for package in ("warp-lang", "numpy", "usd-core", "trimesh", "pydantic"):
+        print(f"  {package:<10} {metadata.version(package)}")
+    print(f"memory: {memory_limit() / 1e9:.1f} GB; processors: {os.cpu_count()}")
+    print("devices:")
+    for device in wp.get_devices():
+        print(f"  {device.alias:<10} {device.name}")
+    if not wp.is_cuda_available():
+        print("  no CUDA device; simulations run on the CPU")
+    print(f"kernel cache: {wp.config.kernel_cache_dir}")
+    print("optional parts:")
+    for extra, module in [("preview", "pyvista")]:
+        missing = "" if util.find_spec(module) else f"missing: pip install 'warpjelly[{extra}]'"
+        print(f"  {extra:<10} {missing or 'present'}")
+
+
+def main() -> None:
+    """Run the command line; never returns."""
+    warnings = logging.StreamHandler()
+    warnings.setFormatter(logging.Formatter("warning: %(message)s"))
+    warnings.setLevel(logging.WARNING)
+    logging.getLogger("warpjelly").handlers = [warnings]
+    sys.exit(_guarded())
+
+
+def _guarded() -> int:
+    """Run a command and return its exit code; whatever goes wrong becomes one line on stderr."""
+    try:
+        return int(app(prog_name="warpjelly", standalone_mode=False) or 0)
+    except WarpjellyError as error:
+        return _fail(str(error), error.exit_code)
+    except typer.TyperException as error:
+        # Without arguments the help was shown, and there is nothing to add.
+        if not (message := error.format_message().rstrip(".")):
+            return error.exit_code
+        context = getattr(error, "ctx", None)
+        hint = f"; see '{context.command_path} --help'" if context is not None else ""
+        return _fail(f"{message}{hint}", error.exit_code)
+    except KeyboardInterrupt:
+        return _fail("interrupted", 130)
+    except BrokenPipeError:
+        # Whoever read our output has gone, as `| head` does; writing a message would only fail again.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 141
+    except MemoryError:
+        return _fail("out of memory; lower the resolution or the particles per edge", EnvironmentFailedError.exit_code)
+    except OSError as error:
+        return _fail(str(error), EnvironmentFailedError.exit_code)
+    except Exception as error:
+        if os.environ.get("WARPJELLY_TRACEBACK"):
+            traceback.print_exc()
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        return _fail(
+            f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); please "
+            "report it as CONTRIBUTING.md says, with the output of a run with WARPJELLY_TRACEBACK=1",
+            EnvironmentFailedError.exit_code,
+        )
+
+
+def _fail(message: str, exit_code: int) -> int:
+    print(f"error: {' '.join(message.split())}", file=sys.stderr)
+    return exit_code
+
+
+def _overrides(settings: list[str]) -> dict[str, Any]:
+    """Parse KEY=VALUE settings; values are TOML, and bare words are strings."""
+    overrides = {}
+    for setting in settings:
+        key, equals, text = setting.partition("=")
+        if not (equals and key):
+            raise InputError(f"--set {setting}: give KEY=VALUE, for example --set solver.dt=5e-4")
+        try:
+            overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            overrides[key.strip()] = text.strip()
+    return overrides
+
+
+def _load(path: Path, overrides: dict[str, Any], frames: int | None) -> Scene:
+    from .scene import load_scene
+
+    return load_scene(path, overrides=overrides, frames=frames)
+
+
+def _summarize(record: dict[str, Any], outcomes: list[Outcome]) -> None:
+    """Print what came of a run."""
+    rate = record["springs_per_second"] / 1e6
+    print(
+        f"{record['scene']}: {record['frames']} frames of {record['voxels']:,} voxels, "
+        f"{record['particles']:,} particles, {record['springs']:,} springs"
+    )
+    print(
+        f"{record['wall_seconds']:.1f} s on {record['device']}: {record['substeps']} substeps a frame of "
+        f"{record['dt'] * 1e3:.4g} ms, {rate:.0f} million springs/s"
+    )
+    for outcome in outcomes:
+        bounds = [("at least", outcome.min), ("at most", outcome.max)]
+        allowed = " and ".join(f"{words} {bound:g}" for words, bound in bounds if bound is not None)
+        verdict = "as expected" if outcome.met else "NOT as expected"
+        print(f"  {outcome.quantity} of {outcome.body}: {outcome.value:.4g}, {verdict} ({allowed})")
+    print(f"stage: {record['stage']}")
+    print(f"look:  warpjelly preview {record['run_dir']} -o {record['scene']}.png")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,112 @@
+"""Measure what a scene expects of itself.
+
+The vocabulary is documented with the fields of ``scene.Expect``; here is how each quantity is measured.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from .simulator import Simulator
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One measured quantity beside its bounds."""
+
+    quantity: str
+    body: str
+    value: float
+    min: float | None
+    max: float | None
+
+    @property
+    def met(self) -> bool:
+        """Whether the value is within the bounds; a value that is not a number is not."""
+        return (self.min is None or self.value >= self.min) and (self.max is None or self.value <= self.max)
+
+    def as_dict(self) -> dict[str, object]:
+        """Return everything, for JSON."""
+        return {**asdict(self), "met": self.met}
+
+
+class Observer:
+    """Watches a run frame by frame; costs nothing where the scene expects nothing."""
+
+    def __init__(self, sim: Simulator) -> None:
+        self._sim = sim
+        self._expectations = list(sim.scene.expect.items())
+        self._rest = sim.positions if self._expectations else np.zeros((0, 3))
+        self._mass = sim.masses if self._expectations else np.zeros(0)
+        self._centers: list[np.ndarray] = []
+        self._heights: list[np.ndarray] = []
+        self._depths: list[np.ndarray] = []
+
+    def observe(self) -> None:
+        """Take in the current frame."""
+        if not self._expectations:
+            return
+        sim = self._sim
+        x, up = sim.positions, sim.scene.up
+        parts = [body.particles for body in sim.model.bodies]
+        self._centers.append(np.array([self._mass[part] @ x[part] / self._mass[part].sum() for part in parts]))
+        self._heights.append(np.array([np.ptp(x[part, up]) for part in parts]))
+        self._depths.append(sim.penetrations())
+
+    def outcomes(self) -> list[Outcome]:
+        """Return the quantities that the scene bounds, at the last frame that was observed."""
+        found = []
+        for quantity, expectation in self._expectations:
+            bodies = self._sim.model.bodies
+            number = next((i for i, body in enumerate(bodies) if body.name == expectation.body), 0)
+            value = float(getattr(self, f"_{quantity}")(number))
+            found.append(Outcome(quantity, bodies[number].name, value, expectation.min, expectation.max))
+        return found
+
+    def _rest_height(self, body: int) -> float:
+        return self._centers[-1][body, self._sim.scene.up]
+
+    def _displacement(self, body: int) -> float:
+        return float(np.linalg.norm(self._centers[-1][body] - self._centers[0][body]))
+
+    def _speed(self, body: int) -> float:
+        return np.linalg.norm(self._sim.velocities[self._sim.model.bodies[body].particles], axis=1).max()
+
+    def _shape_error(self, body: int) -> float:
+        part = self._sim.model.bodies[body].particles
+        return rigid_fit_error(self._rest[part], self._sim.positions[part])
+
+    def _squash(self, body: int) -> float:
+        heights = np.array(self._heights)[:, body]
+        return heights.min() / heights[0]
+
+    def _bounce(self, body: int) -> float:
+        height = np.array(self._centers)[:, body, self._sim.scene.up]
+        rising = np.flatnonzero(np.diff(height) > 0)
+        return height[rising[0] :].max() - height[rising[0]] if len(rising) else 0.0
+
+    def _penetration(self, body: int) -> float:
+        return np.array(self._depths)[:, body].max() / self._sim.model.bodies[body].unit
+
+
+def rigid_fit_error(rest: np.ndarray, now: np.ndarray) -> float:
+    """Return the rms distance of points from the best rigid fit of their rest shape, as a share of its diagonal.
+
+    The best rotation follows from a singular value decomposition (Kabsch 1976, doi:10.1107/S0567739476001873).
+
+    Args:
+        rest: [count, 3].
+        now: the same points, [count, 3].
+    """
+    a, b = rest - rest.mean(axis=0), now - now.mean(axis=0)
+    if not np.isfinite(b).all():
+        return float("nan")
+    u, _, vt = np.linalg.svd(a.T @ b)
+    # A reflection would fit better than any rotation when the determinant is negative; it is not a motion.
+    u[:, -1] *= np.sign(np.linalg.det(u @ vt))
+    rms = np.sqrt(((a @ u @ vt - b) ** 2).sum(axis=1).mean())
+    return float(rms / np.linalg.norm(np.ptp(rest, axis=0)))
