@@ -84,7 +84,13 @@ def add_spring_forces(
         real dx = qx[s] - px[s], dy = qy[s] - py[s], dz = qz[s] - pz[s];
         real du = qu[s] - pu[s], dv = qv[s] - pv[s], dw = qw[s] - pw[s];
         real square = dx * dx + dy * dy + dz * dz;
-        real inverse = square > real(0) ? real(1) / __builtin_elementwise_sqrt(square) : real(0);
+        // Only the builtin becomes a vector instruction; the compiler for GPUs, which never runs this, does not have it.
+        #ifdef __CUDACC__
+        real length = sqrt(square);
+        #else
+        real length = __builtin_elementwise_sqrt(square);
+        #endif
+        real inverse = square > real(0) ? real(1) / length : real(0);
         real approach = (du * dx + dv * dy + dw * dz) * inverse;
         real scale = stiffness * (real(1) - rest * inverse) + damping * approach * inverse;
         gx[s] = scale * dx;
