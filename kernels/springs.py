@@ -84,7 +84,7 @@ def add_spring_forces(
         real dx = qx[s] - px[s], dy = qy[s] - py[s], dz = qz[s] - pz[s];
         real du = qu[s] - pu[s], dv = qv[s] - pv[s], dw = qw[s] - pw[s];
         real square = dx * dx + dy * dy + dz * dz;
-        // Only the builtin becomes a vector instruction; the compiler for GPUs, which never runs this, does not have it.
+        // Only the builtin becomes a vector instruction. The compiler for GPUs, which never run this, does not have it.
         #ifdef __CUDACC__
         real length = sqrt(square);
         #else

@@ -20,18 +20,6 @@ from warpjelly.usd import StageWriter
 SIZE = (320, 180)
 
 
-@pytest.fixture(scope="session")
-def egl() -> None:
-    """Skip where there is no offscreen OpenGL, unless it is required."""
-    if os.environ.get("WARPJELLY_REQUIRE_EGL") == "1":
-        return
-    # In a process of its own: where it does not work, VTK may crash instead of failing.
-    script = "from warpjelly.preview import require_pyvista; require_pyvista()"
-    probe = subprocess.run([sys.executable, "-c", script], check=False, capture_output=True, text=True)
-    if probe.returncode:
-        pytest.skip(f"no offscreen OpenGL: {probe.stderr.strip().splitlines()[-1:]}")
-
-
 def pixels(path: Path) -> np.ndarray:
     """Return a picture, float [height, width, 3] in 0 to 1."""
     from PIL import Image
@@ -62,7 +50,6 @@ FLOOR = {"Y": [0.0, 1.0, 0.0], "Z": [0.0, 0.0, 1.0]}
 
 
 @pytest.mark.egl
-@pytest.mark.usefixtures("egl")
 @pytest.mark.parametrize("up_axis", ["Y", "Z"])
 @pytest.mark.parametrize("frame", [0, 9])
 def test_body_appears_where_the_camera_sees_it(tmp_path: Path, up_axis: str, frame: int) -> None:
@@ -84,7 +71,6 @@ def test_body_appears_where_the_camera_sees_it(tmp_path: Path, up_axis: str, fra
 
 
 @pytest.mark.egl
-@pytest.mark.usefixtures("egl")
 def test_colors_follow_the_forces(tmp_path: Path) -> None:
     """Show the same shape raspberry where forces are low and yellow where they are high."""
     hues = []
@@ -99,7 +85,6 @@ def test_colors_follow_the_forces(tmp_path: Path) -> None:
 
 
 @pytest.mark.egl
-@pytest.mark.usefixtures("egl")
 def test_shadow_falls_on_the_floor(tmp_path: Path) -> None:
     """Darken the floor below the body, so that height and contact can be judged."""
     floor = [{"name": "floor", "type": "plane", "normal": [0.0, 1.0, 0.0], "size": [10.0, 10.0]}]
@@ -116,7 +101,6 @@ def test_shadow_falls_on_the_floor(tmp_path: Path) -> None:
 
 
 @pytest.mark.egl
-@pytest.mark.usefixtures("egl")
 def test_frames_stand_side_by_side(tmp_path: Path) -> None:
     """Lay several frames out in a row, each of the size asked for."""
     path = write_stage(tmp_path / "stage.usdc")
@@ -131,7 +115,6 @@ def test_frames_stand_side_by_side(tmp_path: Path) -> None:
 
 
 @pytest.mark.egl
-@pytest.mark.usefixtures("egl")
 @pytest.mark.parametrize("color", ["indexed", "rgb"])
 def test_hardest_impact_is_the_default(tmp_path: Path, color: str) -> None:
     """Show the frame with the greatest forces unless told otherwise."""
@@ -149,7 +132,6 @@ def test_hardest_impact_is_the_default(tmp_path: Path, color: str) -> None:
 
 
 @pytest.mark.egl
-@pytest.mark.usefixtures("egl")
 def test_all_colliders_are_drawn(tmp_path: Path) -> None:
     """Draw balls, ramps and rooms without a word on the terminal, and the rest pose of an empty run."""
     colliders = [
@@ -169,7 +151,6 @@ def test_all_colliders_are_drawn(tmp_path: Path) -> None:
 
 
 @pytest.mark.egl
-@pytest.mark.usefixtures("egl")
 def test_unwritable_output_is_reported(tmp_path: Path) -> None:
     """Say in one line that the picture cannot be written."""
     path = write_stage(tmp_path / "stage.usdc")
