@@ -329,7 +329,7 @@ def test_an_internal_error_says_where_to_report_it(warpjelly, monkeypatch):
     def fail(*arguments: object, **options: object) -> None:
         raise ZeroDivisionError("by zero")
 
-    monkeypatch.setattr("warpjelly.scene.load_scene", fail)
+    monkeypatch.setattr("warpjelly.scenefile.load_scene", fail)
     code, _, err = warpjelly("check", CUBE)
     assert code == 4
     assert "internal error: ZeroDivisionError" in one_line(err)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from warpjelly.errors import InputError
-from warpjelly.scene import PlaneCollider, Scene, VoxelsBody, load_scene
+from warpjelly.scene import PlaneCollider, Scene, VoxelsBody
+from warpjelly.scenefile import load_scene
 
 SCENES = Path(__file__).parent.parent / "scenes"
 

@@ -3,7 +3,7 @@ from pathlib import Path
 import pytest
 
 from warpjelly.expect import Observer
-from warpjelly.scene import load_scene
+from warpjelly.scenefile import load_scene
 from warpjelly.simulator import Simulator
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -21,7 +21,7 @@ SWITCHED_OFF = [
     ("tree_drop", {"colliders": []}, "bounce"),
     ("tree_drop", {"colliders": []}, "rest_height"),
     ("tree_drop", {"colliders.floor.stiffness": 2000.0}, "penetration"),
-    ("coupler_drop", {"colliders": [], "frames": 60}, "squash"),
+    ("coupler_drop", {"colliders": [], "duration": 1.0}, "squash"),
     ("u_on_sphere", {"colliders.ball.center": [100.0, 0.0, 0.0]}, "bounce"),
     ("u_on_sphere", {"colliders.room.center": [100.0, 0.0, 0.0]}, "rest_height"),
 ]
@@ -29,9 +29,7 @@ SWITCHED_OFF = [
 
 def outcomes(name: str, overrides: dict | None = None) -> dict:
     """Run a scene without its stage and return the measured quantities by name."""
-    overrides = dict(overrides or {})
-    frames = overrides.pop("frames", None)
-    scene = load_scene(SCENES / f"{name}.toml", overrides=overrides, frames=frames)
+    scene = load_scene(SCENES / f"{name}.toml", overrides=overrides)
     sim = Simulator(scene, device="cpu")
     observer = Observer(sim)
     observer.observe()

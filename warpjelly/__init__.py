@@ -18,7 +18,8 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
     from .run import Run, simulate
-    from .scene import Scene, load_scene
+    from .scene import Scene
+    from .scenefile import load_scene
     from .simulator import Simulator
 
 # Loaded at first use, so that the command line answers at once.
@@ -30,7 +31,7 @@ _HOMES = {
     "Scene": "scene",
     "Simulator": "simulator",
     "WarpjellyError": "errors",
-    "load_scene": "scene",
+    "load_scene": "scenefile",
     "simulate": "run",
 }
 

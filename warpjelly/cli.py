@@ -95,6 +95,7 @@ def run(
         MofNCompleteColumn(),
         TextColumn("frames  {task.fields[rate]}"),
         TimeRemainingColumn(),
+        TextColumn("left"),
         console=Console(stderr=True),
         disable=quiet or not sys.stderr.isatty(),
         transient=True,
@@ -278,7 +279,7 @@ def _overrides(settings: list[str]) -> dict[str, Any]:
 
 
 def _load(path: Path, overrides: dict[str, Any], frames: int | None) -> Scene:
-    from .scene import load_scene
+    from .scenefile import load_scene
 
     return load_scene(path, overrides=overrides, frames=frames)
 

@@ -1,0 +1,153 @@
+"""Read a scene file: TOML, overrides, and errors that people can act on."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, get_args
+
+from pydantic import ValidationError
+
+from .errors import InputError
+from .scene import Scene, Table
+
+
+def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, frames: int | None = None) -> Scene:
+    """Read and validate a scene file.
+
+    Args:
+        path: TOML file.
+        overrides: values by dotted key, for example ``{"solver.dt": 5e-4, "bodies.0.size": 2.0}``; an entry of a list
+            goes by its number or its name.
+        frames: number of samples, instead of the scene's frames or duration. What the scene expects of itself goes with
+            its own length, and is left out.
+
+    Raises:
+        InputError: the file cannot be read, is not TOML, or is not a scene; the message names file, key and value.
+    """
+    path = Path(path)
+    try:
+        data = tomllib.loads(path.read_text(encoding="utf-8"))
+    except tomllib.TOMLDecodeError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
+    for key, value in (overrides or {}).items():
+        _override(data, key, value)
+    if frames is not None:
+        data.pop("duration", None)
+        data["frames"] = frames
+        data.pop("expect", None)
+    data.setdefault("name", _identifier(path.stem))
+    try:
+        return Scene.model_validate(data, context={"folder": path.parent})
+    except ValidationError as error:
+        raise InputError(f"{path}: {_explain(error)}") from error
+
+
+def _override(data: dict[str, Any], key: str, value: Any) -> None:
+    """Set a dotted key in nested tables and lists, making tables on the way."""
+    *parents, last = key.split(".")
+    node: Any = data
+    for part in parents:
+        if isinstance(node, list):
+            node = node[_entry(node, part, key)]
+        elif isinstance(node, dict):
+            node = node.setdefault(part, {})
+        else:
+            raise InputError(f"--set {key}: '{part}' is inside a value that is not a table")
+    if isinstance(node, list):
+        node[_entry(node, last, key)] = value
+    elif isinstance(node, dict):
+        node[last] = value
+    else:
+        raise InputError(f"--set {key}: '{last}' is inside a value that is not a table")
+
+
+def _entry(entries: list[Any], part: str, key: str) -> int:
+    """Return the position of a list entry given by its number or its name."""
+    names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
+    if part in names:
+        return names.index(part)
+    if part.isdigit() and int(part) < len(entries):
+        return int(part)
+    known = ", ".join([f"0 to {len(entries) - 1}", *(name for name in names if name)]) if entries else "none"
+    raise InputError(f"--set {key}: no entry '{part}'; entries: {known}")
+
+
+def _identifier(text: str) -> str:
+    """Turn a file name into a valid scene name."""
+    name = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:63]
+    return name if name and not name[0].isdigit() else f"_{name}"
+
+
+def _explain(error: ValidationError) -> str:
+    """Say in one line what is wrong with the scene first: key, value, what is allowed."""
+    problems = error.errors(include_url=False)
+    first = problems[0]
+    context = first.get("ctx", {})
+    value = first["input"]
+    key = context["key"] if first["type"] == "scene" else _key(first["loc"])
+    what = first["msg"].replace("Input should", "must").replace("Value should", "must")
+    if first["type"] == "unknown_key":
+        key = ".".join(filter(None, [key, context["key"]]))
+        message = f"{key}: unknown key; {what}"
+    elif first["type"] == "missing":
+        message = f"{key}: missing; this key is required{_described(first['loc'])}"
+    elif first["type"] == "union_tag_not_found":
+        message = f"{key}.type: missing; this key is required"
+    elif first["type"] == "union_tag_invalid":
+        message = f"{key}.type = {context['tag']!r}: must be one of {context['expected_tags']}"
+    elif first["type"] == "scene":
+        message = f"{key} = {_shown(context['value'])}: {what}" if context["value"] is not None else f"{key}: {what}"
+    elif isinstance(value, Mapping):
+        message = f"{key}: {what}"
+    else:
+        message = f"{key} = {_shown(value)}: {what}{_described(first['loc'])}"
+    return message + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")
+
+
+def _key(location: tuple[int | str, ...]) -> str:
+    """Return the dotted key of an error, without the tags that pydantic adds for bodies, colliders and unions."""
+    parts = [str(part) for part in location]
+    if len(parts) > 2 and parts[0] in ("bodies", "colliders"):
+        del parts[2]
+    return ".".join(part for part in parts if "[" not in part and not part.startswith("literal"))
+
+
+def _described(location: tuple[int | str, ...]) -> str:
+    """Return the description of the field at an error, in brackets."""
+    tables: list[type[Table]] = [Scene]
+    description = None
+    for part in location:
+        if fields := [table.model_fields[part] for table in tables if part in table.model_fields]:
+            description = fields[0].description
+            tables = [table for field in fields for table in _tables_in(field.annotation)]
+        elif tagged := [table for table in tables if part in _tags(table)]:
+            tables = tagged
+    return f" ({description})" if description else ""
+
+
+def _tables_in(annotation: Any) -> list[type[Table]]:
+    """Return the tables that a field's annotation mentions."""
+    if isinstance(annotation, type) and issubclass(annotation, Table):
+        return [annotation]
+    return [table for part in get_args(annotation) for table in _tables_in(part)]
+
+
+def _tags(table: type[Table]) -> tuple[str, ...]:
+    """Return the values of ``type`` that select a table."""
+    return get_args(table.model_fields["type"].annotation) if "type" in table.model_fields else ()
+
+
+def _shown(value: Any) -> str:
+    """Write a value as TOML would, cut when long."""
+    try:
+        text = json.dumps(value, ensure_ascii=False)
+    except (TypeError, ValueError):
+        text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
