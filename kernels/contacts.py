@@ -94,6 +94,10 @@ def may_touch(colliders: Any, c: int, body: int, lower: Any, upper: Any):
     return bounds.boxes_overlap(lower, upper, colliders.lower[c], colliders.upper[c])
 
 
+# Lanes per chunk where a launch runs in parallel; where it runs one thread after another, one lane is best.
+PARALLEL_LANES = 32
+
+
 @wp.kernel
 def add_contact_forces(
     # Model:

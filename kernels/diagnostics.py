@@ -11,19 +11,26 @@ wp.set_module_options({"enable_backward": False})
 # Columns of the sums over a chunk, measured about the origin.
 KINETIC, POTENTIAL, CONTACT, SPEED, DEPTH, CONTACTS, MOMENTUM, ANGULAR_MOMENTUM = 0, 1, 2, 3, 4, 5, 6, 9
 COLUMNS = 12
+# Whoever is farther from the origin [m] or faster [m/s] than this is lost: a simulation that blows up passes here on
+# its way to infinity, and its frames would only spoil the stage.
+MAX_DISTANCE = 1e6
+MAX_SPEED = 1e5
 
 
 @wp.kernel
-def find_non_finite(
+def find_lost(
     # State in:
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
     # Out:
     first: wp.array(dtype=wp.int32),
 ):
-    """Lower first[0] to the smallest index of a particle whose position or velocity is not finite."""
+    """Lower first[0] to the smallest index of a particle whose position or velocity is beyond the limits."""
     i = wp.tid()
-    if not (wp.isfinite(vectors.load(x, i)) and wp.isfinite(vectors.load(v, i))):
+    distance = wp.length(vectors.load(x, i))
+    speed = wp.length(vectors.load(v, i))
+    # Numbers that are not finite fail every comparison, or this one.
+    if not (distance <= type(distance)(MAX_DISTANCE) and speed <= type(speed)(MAX_SPEED)):
         wp.atomic_min(first, 0, i)
 
 

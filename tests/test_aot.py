@@ -34,7 +34,7 @@ def launch_everything() -> None:
     for precision in ("float32", "float64"):
         simulator = Simulator(make_scene(colliders=colliders, solver={"precision": precision}), device="cpu")
         simulator.step()
-        simulator.first_non_finite()
+        simulator.first_lost()
         simulator.diagnostics()
         simulator.surfaces()
         # The kernel of the springs on a GPU.

@@ -62,9 +62,10 @@ def check(cells: np.ndarray, particles_per_edge: int) -> None:
     assert Counter(zip(ends, lattice.spring_kinds.tolist(), strict=True)) == Counter(expected.springs.items())
 
     # Planned before built: particles exactly, springs never too few.
-    particles, springs = count_lattice(cells, particles_per_edge=particles_per_edge)
+    particles, springs, surface = count_lattice(cells, particles_per_edge=particles_per_edge)
     assert particles == len(lattice.particles)
     assert springs >= len(lattice.springs)
+    assert surface == len(lattice.surface_quads) + 2
     assert lattice.voxel_count == np.count_nonzero(cells)
 
     check_surface(lattice, vertices, units)

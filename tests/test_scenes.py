@@ -32,10 +32,10 @@ def outcomes(name: str, overrides: dict | None = None) -> dict:
     scene = load_scene(SCENES / f"{name}.toml", overrides=overrides)
     sim = Simulator(scene, device="cpu")
     observer = Observer(sim)
-    observer.observe()
+    observer.observe(sim.diagnostics()["penetrations"])
     for _ in range(scene.frame_count - 1):
         sim.advance_frame()
-        observer.observe()
+        observer.observe(sim.diagnostics()["penetrations"])
     return {outcome.quantity: outcome for outcome in observer.outcomes()}
 
 

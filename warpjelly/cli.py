@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import signal
 import sys
 import tomllib
 import traceback
@@ -107,20 +108,20 @@ def run(
             rate = f"{speed:.1f}/s" if speed else ""
             bar.update(task, completed=done, description="simulating", rate=rate)
 
-        from .run import simulate
+        from .run import RunEndedError, simulate
 
+        ended = None
         try:
             result = simulate(loaded, output=output, device=device, force=force, progress=show)
-        except KeyboardInterrupt:
-            print("interrupted; the frames that were finished are in the run directory", file=sys.stderr)
-            raise
-    record = result.record
+        except RunEndedError as error:
+            ended, result = error, error.run
     if as_json:
-        print(json.dumps(record))
+        print(json.dumps(result.record, allow_nan=False))
     elif not quiet:
-        _summarize(record, result.outcomes)
-    if result.error is not None:
-        raise result.error
+        _summarize(result.record, result.outcomes)
+    if ended is not None:
+        sys.stdout.flush()
+        raise ended
 
 
 @app.command()
@@ -222,6 +223,8 @@ def main() -> None:
     warnings.setFormatter(logging.Formatter("warning: %(message)s"))
     warnings.setLevel(logging.WARNING)
     logging.getLogger("warpjelly").handlers = [warnings]
+    # Termination is an interruption like Ctrl-C: the frames that were finished are saved.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(_guarded())
 
 
@@ -273,7 +276,7 @@ def _overrides(settings: list[str]) -> dict[str, Any]:
             raise InputError(f"--set {setting}: give KEY=VALUE, for example --set solver.dt=5e-4")
         try:
             overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
+        except ValueError:
             overrides[key.strip()] = text.strip()
     return overrides
 

@@ -15,6 +15,9 @@ from .errors import InputError
 
 log = logging.getLogger("warpjelly")
 
+# What Warp says at each start where no driver is installed.
+NO_GPU = "Could not find or load the NVIDIA CUDA driver"
+
 
 def start_warp() -> None:
     """Initialise Warp without a word on the terminal; what it says goes to the log."""
@@ -40,7 +43,7 @@ def choose_device(name: str = "auto") -> str:
 
 @contextmanager
 def _stderr_logged() -> Iterator[None]:
-    """Send what native code writes to stderr to the log; without a GPU, Warp warns there at every start."""
+    """Send what native code writes to stderr to the log."""
     sys.stderr.flush()
     with tempfile.TemporaryFile() as file:
         stderr = os.dup(2)
@@ -52,4 +55,5 @@ def _stderr_logged() -> Iterator[None]:
             os.close(stderr)
             file.seek(0)
             for line in file.read().decode(errors="replace").splitlines():
-                log.info("%s", line)
+                # A machine without a GPU is nothing to warn of; a GPU that cannot be used is.
+                log.log(logging.INFO if NO_GPU in line else logging.WARNING, "%s", line)

@@ -16,7 +16,7 @@ class InputError(WarpjellyError):
 
 
 class DivergedError(WarpjellyError):
-    """The simulation left the finite numbers; what was simulated before is kept."""
+    """The simulation left the world; what was simulated before is kept."""
 
     exit_code = 3
 

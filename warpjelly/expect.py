@@ -40,22 +40,24 @@ class Observer:
     def __init__(self, sim: Simulator) -> None:
         self._sim = sim
         self._expectations = list(sim.scene.expect.items())
-        self._rest = sim.positions if self._expectations else np.zeros((0, 3))
+        self._rest = self._positions = sim.positions if self._expectations else np.zeros((0, 3))
+        self._velocities = np.zeros((0, 3))
         self._mass = sim.masses if self._expectations else np.zeros(0)
         self._centers: list[np.ndarray] = []
         self._heights: list[np.ndarray] = []
         self._depths: list[np.ndarray] = []
 
-    def observe(self) -> None:
-        """Take in the current frame."""
+    def observe(self, penetrations: np.ndarray) -> None:
+        """Take in the current frame; penetrations are those of ``Simulator.diagnostics``."""
         if not self._expectations:
             return
         sim = self._sim
-        x, up = sim.positions, sim.scene.up
+        self._positions, self._velocities = sim.positions, sim.velocities
+        x, up = self._positions, sim.scene.up
         parts = [body.particles for body in sim.model.bodies]
         self._centers.append(np.array([self._mass[part] @ x[part] / self._mass[part].sum() for part in parts]))
         self._heights.append(np.array([np.ptp(x[part, up]) for part in parts]))
-        self._depths.append(sim.penetrations())
+        self._depths.append(penetrations)
 
     def outcomes(self) -> list[Outcome]:
         """Return the quantities that the scene bounds, at the last frame that was observed."""
@@ -74,11 +76,11 @@ class Observer:
         return float(np.linalg.norm(self._centers[-1][body] - self._centers[0][body]))
 
     def _speed(self, body: int) -> float:
-        return np.linalg.norm(self._sim.velocities[self._sim.model.bodies[body].particles], axis=1).max()
+        return np.linalg.norm(self._velocities[self._sim.model.bodies[body].particles], axis=1).max()
 
     def _shape_error(self, body: int) -> float:
         part = self._sim.model.bodies[body].particles
-        return rigid_fit_error(self._rest[part], self._sim.positions[part])
+        return rigid_fit_error(self._rest[part], self._positions[part])
 
     def _squash(self, body: int) -> float:
         heights = np.array(self._heights)[:, body]

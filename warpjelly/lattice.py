@@ -78,7 +78,7 @@ def build_lattice(cells: np.ndarray, *, origin: np.ndarray, cell_size: float, pa
     )
 
 
-def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[int, int]:
+def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[int, int, int]:
     """Count what ``build_lattice`` would make without making it, from the corners, edges and faces of the jelly cubes.
 
     Args:
@@ -86,7 +86,8 @@ def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[in
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
 
     Returns:
-        The number of particles, exact, and an upper bound of the number of springs, close for thick bodies.
+        The number of particles, exact; an upper bound of the number of springs, close for thick bodies; about the
+        number of points on the surface.
     """
     cubes = int(np.count_nonzero(cells))
     vertices = int(corner_labels()[1][_vertex_patterns(cells)].sum(dtype=np.int64))
@@ -104,7 +105,9 @@ def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[in
     unit_edges = edges * n + faces * 2 * n * (n - 1) + cubes * 3 * n * (n - 1) ** 2
     unit_faces = faces * n**2 + cubes * 3 * n**2 * (n - 1)
     # Bend springs join consecutive structural ones, so there are fewer of them.
-    return particles, 2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3
+    # Each face of a cube is shared or exposed, and a closed surface of quads has about as many points as faces.
+    exposed = 2 * faces - 6 * cubes
+    return particles, 2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3, exposed * n**2 + 2
 
 
 @functools.cache

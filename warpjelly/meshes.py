@@ -35,6 +35,6 @@ def load_mesh(path: Path) -> trimesh.Trimesh:
         raise InputError(f"{path}: the mesh has coordinates that are not finite numbers")
     if not np.ptp(used.reshape(-1, 3), axis=0).max() > 0:
         raise InputError(f"{path}: the mesh has no size; all its vertices coincide")
-    # Formats that repeat the vertices of every triangle would never be watertight otherwise.
-    mesh.merge_vertices(merge_tex=True, merge_norm=True)
-    return mesh
+    # Formats that repeat the vertices of every triangle would never be watertight otherwise. They repeat them exactly.
+    vertices, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return trimesh.Trimesh(vertices, number.reshape(-1)[mesh.faces], process=False)

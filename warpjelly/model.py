@@ -13,7 +13,7 @@ from warpjelly.kernels import contacts, springs
 
 from .lattice import REST_LENGTHS, Lattice, build_lattice
 from .plan import BodyPlan, Plan
-from .scene import AnyCollider, BoxCollider, Material, PlaneCollider, Scene, SphereCollider
+from .scene import DEFAULT_PARTICLE_MASS, AnyCollider, BoxCollider, Material, PlaneCollider, Scene, SphereCollider
 
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
@@ -193,7 +193,7 @@ def _masses(lattice: Lattice, material: Material) -> np.ndarray:
     """Return the mass of each particle, float64 [particle_count], kg."""
     if material.density is not None:
         return material.density * lattice.unit**3 / 8.0 * lattice.cell_counts
-    mass = 0.01 if material.particle_mass is None else material.particle_mass
+    mass = DEFAULT_PARTICLE_MASS if material.particle_mass is None else material.particle_mass
     return np.full(len(lattice.particles), mass)
 
 

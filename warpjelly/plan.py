@@ -11,18 +11,21 @@ import numpy as np
 
 from .errors import InputError
 from .lattice import count_lattice
-from .scene import Body, CubeBody, ModelBody, Scene, VoxelsBody
+from .scene import MAX_LENGTH, MIN_LENGTH, Body, CubeBody, ModelBody, Scene, VoxelsBody
 
 log = logging.getLogger("warpjelly")
 
-# Largest indices that the int32 arrays of particles and of surface quads can hold.
-MAX_PARTICLES = 2**31 - 1
+# Warp's strides are int32, so a row of an array [3, particle_count] holds at most this many bytes.
+MAX_ROW_BYTES = 2**31 - 1
+BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 
 # Bytes at the peak of building and running a scene, as measured: within 5 % for a solid cube of 128^3 particles.
 BYTES_AT_REST = 290e6
 BYTES_PER_UNIT_CELL = 60
 BYTES_PER_PARTICLE = {"float32": 80, "float64": 100}
 BYTES_PER_SPRING = 20
+# Points, normals, colours and forces of a surface point at a frame; all of them are in memory until the stage is whole.
+BYTES_PER_SURFACE_SAMPLE = 36
 # Scan conversion holds one byte per cell three times.
 BYTES_PER_GRID_CELL = 4
 
@@ -42,6 +45,8 @@ class BodyPlan:
     particle_count: int
     spring_bound: int
     """No more springs than this."""
+    surface_bound: int
+    """About as many points on the surface as this."""
 
 
 @dataclass(frozen=True)
@@ -75,6 +80,7 @@ class Plan:
             + BYTES_PER_UNIT_CELL * unit_cells
             + BYTES_PER_PARTICLE[self.scene.solver.precision] * self.particle_count
             + BYTES_PER_SPRING * self.spring_bound
+            + BYTES_PER_SURFACE_SAMPLE * self.scene.frame_count * sum(plan.surface_bound for plan in self.bodies)
         )
 
 
@@ -85,8 +91,9 @@ def plan_scene(scene: Scene) -> Plan:
         InputError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
     plan = Plan(scene, [_plan_body(body) for body in scene.bodies])
-    if plan.particle_count > MAX_PARTICLES:
-        raise InputError(f"{plan.particle_count:,} particles are more than the {MAX_PARTICLES:,} that indices can hold")
+    most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]
+    if plan.particle_count > most:
+        raise InputError(f"{plan.particle_count:,} particles are more than the {most:,} that arrays can hold")
     _require_memory(plan.memory_bytes, f"{plan.particle_count:,} particles and {plan.spring_bound:,} springs")
     return plan
 
@@ -102,8 +109,8 @@ def _plan_body(body: Body) -> BodyPlan:
         cells, origin, cell_size = _voxelize_model(body)
     else:
         raise TypeError(f"unknown body {type(body).__name__}")
-    particles, springs = count_lattice(cells, particles_per_edge=body.particles_per_edge)
-    return BodyPlan(body, cells, origin, cell_size, body.particles_per_edge, particles, springs)
+    counts = count_lattice(cells, particles_per_edge=body.particles_per_edge)
+    return BodyPlan(body, cells, origin, cell_size, body.particles_per_edge, *counts)
 
 
 def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
@@ -112,6 +119,12 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
     from .voxelize import voxelize
 
     mesh = load_mesh(body.file)
+    largest = mesh.extents.max() * body.scale
+    if not MIN_LENGTH <= largest <= MAX_LENGTH:
+        raise InputError(
+            f"{body.file}: the model is {largest:.3g} m large; between {MIN_LENGTH:g} and {MAX_LENGTH:g} m can be "
+            f"simulated: change bodies.{body.name}.scale"
+        )
     sides = np.ceil(mesh.extents / mesh.extents.max() * body.resolution).astype(int)
     cell_count = int(np.prod(np.maximum(sides, 1).astype(object)))
     _require_memory(

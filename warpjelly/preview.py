@@ -6,7 +6,6 @@ import importlib
 import os
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +14,7 @@ from pxr import Usd, UsdGeom
 
 from .colors import SRGB_TABLE, srgb_from_linear
 from .errors import EnvironmentFailedError, InputError
+from .files import whole_file
 from .usd import open_stage
 
 if TYPE_CHECKING:
@@ -334,13 +334,9 @@ def _laid_out(stage: Usd.Stage, frames: list[int], panels: list[np.ndarray]) -> 
 
 
 def _save(picture: Any, output: Path) -> None:
-    unfinished = output.with_name(f"{output.stem}.tmp{output.suffix}")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
-        picture.save(unfinished, format="PNG")
-        os.replace(unfinished, output)
+        with whole_file(output) as unfinished:
+            picture.save(unfinished, format="PNG")
     except OSError as error:
         raise EnvironmentFailedError(f"{output}: cannot write the preview: {error.strerror or error}") from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)

@@ -5,17 +5,17 @@ from __future__ import annotations
 import csv
 import json
 import logging
-import os
 import platform
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from .errors import DivergedError, EnvironmentFailedError, InputError
+from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
 from .expect import Observer, Outcome
+from .files import whole_file
 from .plan import plan_scene
 from .scene import Scene
 from .simulator import Simulator
@@ -38,9 +38,16 @@ class Run:
     record: dict[str, Any]
     """The contents of run.json."""
     outcomes: list[Outcome]
-    """What the scene expects of itself, measured."""
-    error: DivergedError | None = field(default=None)
-    """Why the run ended early, where it did."""
+    """What the scene expects of itself, measured at the last frame that was finished."""
+
+
+class RunEndedError(WarpjellyError):
+    """A run ended before its last frame; the frames that were finished are in the run directory."""
+
+    def __init__(self, message: str, run: Run, exit_code: int) -> None:
+        super().__init__(message)
+        self.run = run
+        self.exit_code = exit_code
 
 
 def simulate(
@@ -60,42 +67,49 @@ def simulate(
         force: replace a run that is there already.
         progress: called after each frame with the number of frames done and in all.
 
-    Returns:
-        What came of it. A run that diverged has ``error`` set; its frames up to there are in the stage.
-
     Raises:
         InputError: the scene cannot be built, or the directory holds a run and ``force`` is not set.
+        RunEndedError: the simulation diverged or was interrupted; the error has the run up to there.
         EnvironmentFailedError: the run directory cannot be written.
-        KeyboardInterrupt: after saving the frames that were finished.
     """
     folder = Path(output) if output is not None else Path("outputs") / scene.name
-    if not force and (folder / RECORD_NAME).exists() | (folder / STAGE_NAME).exists():
-        raise InputError(f"{folder}: holds a run already; replace it with --force, or choose another folder with -o")
+    if not force:
+        _refuse_to_replace(folder)
     plan = plan_scene(scene)
     sim = Simulator(plan, device=device)
+    _warn_of_deep_starts(sim)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        # Without its record a directory does not count as a run, so one that is being replaced never looks finished.
+        # Without its record a run does not count as finished. The old stage stays until the new one is whole.
         (folder / RECORD_NAME).unlink(missing_ok=True)
-        (folder / STAGE_NAME).unlink(missing_ok=True)
         with open(folder / METRICS_NAME, "w", newline="", encoding="utf-8") as metrics:
             return _simulate_into(folder, sim, csv.writer(metrics), progress)
     except OSError as error:
         raise EnvironmentFailedError(f"{folder}: cannot write the run: {error.strerror or error}") from error
 
 
+def _refuse_to_replace(folder: Path) -> None:
+    """Raise InputError where a folder holds a run."""
+    found = [name for name in (RECORD_NAME, STAGE_NAME, METRICS_NAME) if (folder / name).exists()]
+    if found:
+        what = "a run" if RECORD_NAME in found else "a run that did not finish"
+        raise InputError(
+            f"{folder}: holds {what} already ({', '.join(found)}); replace it with --force, or choose another folder "
+            "with -o"
+        )
+
+
 def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callable[[int, int], None]) -> Run:
     scene, total = sim.scene, sim.scene.frame_count
-    rest = sim.surfaces()
     meshes = [
         SurfaceMesh(body.name, surface.points, surface.normals, body.quads)
-        for body, surface in zip(sim.model.bodies, rest, strict=True)
+        for body, surface in zip(sim.model.bodies, sim.surfaces(), strict=True)
     ]
-    _warn_of_deep_starts(sim)
     writer = StageWriter(folder / STAGE_NAME, scene=scene, meshes=meshes, provenance=provenance(scene, sim))
     observer = Observer(sim)
     sim.prepare()
-    stepping, frames, error, interrupted = 0.0, 0, None, None
+    stepping, frames = 0.0, 0
+    ended: DivergedError | KeyboardInterrupt | None = None
     began = time.perf_counter()
     try:
         for index in range(total):
@@ -103,19 +117,20 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
                 before = time.perf_counter()
                 sim.advance_frame()
                 stepping += time.perf_counter() - before
-            row = _metrics_row(index, sim)
+            figures = sim.diagnostics()
+            row = _metrics_row(index, sim.time, figures)
             if index == 0:
                 metrics.writerow(row)
             metrics.writerow(row.values())
-            observer.observe()
+            observer.observe(figures["penetrations"])
             writer.write_frame(index, sim.surfaces())
             frames = index + 1
             progress(frames, total)
-    except DivergedError as diverged:
-        error = diverged
-    except KeyboardInterrupt as interrupt:
-        interrupted = interrupt
-    writer.close()
+    except (DivergedError, KeyboardInterrupt) as error:
+        ended = error
+    finally:
+        # Whatever happens, also what nobody foresaw: the frames that were finished are saved.
+        writer.close()
     evaluations = max(frames - 1, 0) * scene.substeps
     outcomes = observer.outcomes()
     record = {
@@ -132,15 +147,19 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         "precision": scene.solver.precision,
         "wall_seconds": time.perf_counter() - began,
         "springs_per_second": sim.model.spring_count * evaluations / stepping if evaluations else 0.0,
-        "diverged": error is not None,
-        "interrupted": interrupted is not None,
+        "diverged": isinstance(ended, DivergedError),
+        "interrupted": isinstance(ended, KeyboardInterrupt),
         "expect": [outcome.as_dict() for outcome in outcomes],
         **provenance(scene, sim),
     }
-    _write_atomically(folder / RECORD_NAME, json.dumps(record, indent=2) + "\n")
-    if interrupted is not None:
-        raise interrupted
-    return Run(record, outcomes, error)
+    with whole_file(folder / RECORD_NAME) as unfinished:
+        unfinished.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    run = Run(record, outcomes)
+    if isinstance(ended, DivergedError):
+        raise RunEndedError(str(ended), run, ended.exit_code) from ended
+    if ended is not None:
+        raise RunEndedError(f"interrupted after {frames} of {total} frames, which are in {folder}", run, 130) from ended
+    return run
 
 
 def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
@@ -155,6 +174,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     """
     plan = plan_scene(scene)
     sim = Simulator(plan, device=device)
+    _warn_of_deep_starts(sim)
     sim.step()
     sim.surfaces()
     sim.diagnostics()
@@ -196,28 +216,20 @@ def provenance(scene: Scene, sim: Simulator) -> dict[str, Any]:
     }
 
 
-def _metrics_row(index: int, sim: Simulator) -> dict[str, float]:
+def _metrics_row(index: int, seconds: float, figures: Mapping[str, Any]) -> dict[str, float]:
     """Return one row of metrics.csv by column name; SI units."""
-    row: dict[str, float] = {"frame": index, "time": sim.time}
-    for name, value in sim.diagnostics().items():
+    row: dict[str, float] = {"frame": index, "time": seconds}
+    for name, value in figures.items():
         if name in ("momentum", "angular_momentum"):
             row |= {f"{name}_{axis}": float(component) for axis, component in zip("xyz", value, strict=True)}
+        elif name == "penetrations":
+            row["max_penetration"] = float(value.max())
         else:
             row[name] = value
     return row
 
 
 def _warn_of_deep_starts(sim: Simulator) -> None:
-    for body, depth in zip(sim.model.bodies, sim.penetrations(), strict=True):
+    for body, depth in zip(sim.model.bodies, sim.diagnostics()["penetrations"], strict=True):
         if depth > DEEP_START * body.unit:
             log.warning("body '%s' starts %.3g m deep in a collider and will be thrown out of it", body.name, depth)
-
-
-def _write_atomically(path: Path, text: str) -> None:
-    """Write a file so that it is there whole or not at all, even after a power loss."""
-    temporary = path.with_name(f"{path.name}.tmp.{os.getpid()}")
-    with open(temporary, "w", encoding="utf-8") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(temporary, path)

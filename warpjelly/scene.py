@@ -25,9 +25,15 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-# Lengths and coordinates beyond this [m], and other magnitudes beyond the second, are typing errors, not scenes.
+# Coordinates and lengths beyond this [m], lengths below this [m] and other magnitudes beyond this are typing errors.
 MAX_LENGTH = 1e5
+MIN_LENGTH = 1e-6
 MAX_MAGNITUDE = 1e12
+# Speeds [m/s], turning rates [rad/s] and accelerations [m/s^2] beyond this as well.
+MAX_RATE = 1e4
+# Masses [kg] and densities [kg/m^3] below this have no inverse that float32 can hold beside forces.
+MIN_MASS = 1e-9
+DEFAULT_PARTICLE_MASS = 0.01  # kg
 # A scene asks for at most this many samples and substeps per frame; more would never finish.
 MAX_FRAMES = 1_000_000
 MAX_SUBSTEPS = 1_000_000
@@ -36,8 +42,11 @@ Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_MAGNIT
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_MAGNITUDE)]
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_MAGNITUDE)]
 Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_LENGTH, le=MAX_LENGTH)]
-Length = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-6, le=MAX_LENGTH)]
+Length = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_LENGTH, le=MAX_LENGTH)]
+Mass = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_MASS, le=MAX_MAGNITUDE)]
+Rate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_RATE, le=MAX_RATE)]
 Vector = tuple[Number, Number, Number]
+Rates = tuple[Rate, Rate, Rate]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Switch = Annotated[bool, Field(strict=True)]
 # Names become prim names in the stage, so they are USD identifiers.
@@ -93,10 +102,10 @@ class Material(Table):
     law: Literal["strain", "hooke"] = Field(
         "strain", description="strain: force = k (l/r - 1), the same at every spring length; hooke: force = k (l - r)"
     )
-    particle_mass: Positive | None = Field(
-        None, description="kg, the same for every particle; 0.01 unless density is given"
+    particle_mass: Mass | None = Field(
+        None, description=f"kg, the same for every particle; {DEFAULT_PARTICLE_MASS} unless density is given"
     )
-    density: Positive | None = Field(None, description="kg/m^3; an eighth of a unit cell's mass goes to each corner")
+    density: Mass | None = Field(None, description="kg/m^3; an eighth of a unit cell's mass goes to each corner")
     structural: SpringConstants = Field(SpringConstants(), description="springs to the 6 direct neighbours")
     shear: SpringConstants = Field(SpringConstants(), description="springs to the 12 face and 8 body diagonals")
     bend: SpringConstants = Field(SpringConstants(), description="springs to the second neighbours along each axis")
@@ -115,8 +124,8 @@ class Body(Table):
     material: Name = Field(description="one of [materials]")
     position: Point = Field((0.0, 0.0, 0.0), description="where the body's origin is put, m")
     rotation: Vector = Field((0.0, 0.0, 0.0), description="degrees about x, then y, then z, through the body's origin")
-    velocity: Vector = Field((0.0, 0.0, 0.0), description="of the centre of mass, m/s")
-    angular_velocity: Vector = Field((0.0, 0.0, 0.0), description="about the centre of mass, rad/s")
+    velocity: Rates = Field((0.0, 0.0, 0.0), description="of the centre of mass, m/s")
+    angular_velocity: Rates = Field((0.0, 0.0, 0.0), description="about the centre of mass, rad/s")
 
 
 class CubeBody(Body):
@@ -228,12 +237,22 @@ class PlaneCollider(Collider):
 
     def frame(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Return the unit vectors (tangent, bitangent, normal), float64 [3] each, right-handed."""
-        normal = np.array(self.normal) / np.linalg.norm(self.normal)
-        # Without a tangent, the axis that is least aligned with the normal gives the best-conditioned one.
-        tangent = np.array(self.tangent) if self.tangent is not None else np.eye(3)[np.argmin(np.abs(normal))]
-        tangent = tangent - normal * (tangent @ normal)
-        tangent /= np.linalg.norm(tangent)
-        return tangent, np.cross(normal, tangent), normal
+        return plane_frame(self.normal, self.tangent)
+
+
+def plane_frame(normal: Sequence[float], tangent: Sequence[float] | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the unit vectors (tangent, bitangent, normal) of a plane, float64 [3] each, right-handed.
+
+    Args:
+        normal: of any length, [3].
+        tangent: direction of the first side, made perpendicular to the normal, [3]; chosen unless given.
+    """
+    n = np.array(normal) / np.linalg.norm(normal)
+    # Without a tangent, the axis that is least aligned with the normal gives the best-conditioned one.
+    t = np.array(tangent) if tangent is not None else np.eye(3)[np.argmin(np.abs(n))]
+    t = t - n * (t @ n)
+    t /= np.linalg.norm(t)
+    return t, np.cross(n, t), n
 
 
 class SphereCollider(Collider):
@@ -322,7 +341,7 @@ class Scene(Table):
     )
     fps: float = Field(60.0, strict=True, allow_inf_nan=False, ge=0.1, le=1e5, description="samples per second")
     up_axis: Literal["Y", "Z"] = Field("Y", description="which axis points up")
-    gravity: Vector | None = Field(None, description="m/s^2; 9.81 downwards unless given")
+    gravity: Rates | None = Field(None, description="m/s^2; 9.81 downwards unless given")
     solver: Solver = Field(Solver(), description="time integration")
     materials: dict[Name, Material] = Field(min_length=1, description="materials by name")
     bodies: list[AnyBody] = Field(min_length=1, description="what is made of jelly")

@@ -30,10 +30,11 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     path = Path(path)
     try:
         data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
+    # TOML's own errors are among these, and numbers of thousands of digits.
+    except ValueError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
     for key, value in (overrides or {}).items():

@@ -43,7 +43,9 @@ class Simulator:
         self.device = choose_device(device)
         self.model: Model
         self.state: State
-        self.model, self.state = build(plan, device=self.device)
+        # Nor can Warp allocate in one thread while it captures in another.
+        with _capture_lock:
+            self.model, self.state = build(plan, device=self.device)
         self.substep_count = 0
         """Substeps since the start."""
         chunk_count = len(self.model.chunk_body)
@@ -51,7 +53,7 @@ class Simulator:
         with wp.ScopedDevice(self.device):
             self._lower = wp.zeros((3, chunk_count), dtype=self.model.real)
             self._upper = wp.zeros((3, chunk_count), dtype=self.model.real)
-            self._non_finite = wp.zeros(1, dtype=wp.int32)
+            self._lost = wp.zeros(1, dtype=wp.int32)
             self._elastic = wp.zeros(1, dtype=wp.float64)
             self._sums = wp.zeros((chunk_count, diagnostics.COLUMNS), dtype=wp.float64)
             self._points = wp.zeros(point_count, dtype=wp.vec3f)
@@ -60,7 +62,9 @@ class Simulator:
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
         self._graphs: dict[int, Any] = {}
         self._capturable = True
+        # Kernels compile at their first launch, which must not be inside a capture; a step of no time changes nothing.
         self._add_forces()
+        self._integrate(0.0)
 
     @property
     def time(self) -> float:
@@ -89,12 +93,13 @@ class Simulator:
 
     def prepare(self) -> None:
         """Compile and capture what frames need, so that the first one takes no longer than the others."""
-        for substeps in set(self._blocks(self.scene.substeps)):
+        for substeps in set(self._frame_blocks()):
             self._graph(substeps)
 
     def step(self, count: int = 1) -> None:
         """Advance by a number of substeps."""
-        for substeps in self._blocks(count):
+        frames, rest = divmod(count, self.scene.substeps)
+        for substeps in self._frame_blocks() * frames + [1] * rest:
             if (graph := self._graph(substeps)) is not None:
                 wp.capture_launch(graph)
             else:
@@ -106,31 +111,23 @@ class Simulator:
         """Advance by one frame.
 
         Raises:
-            DivergedError: a position or velocity is not finite any more.
+            DivergedError: a position or velocity is not finite any more, or absurd.
         """
         self.step(self.scene.substeps)
-        if (particle := self.first_non_finite()) is not None:
+        if (particle := self.first_lost()) is not None:
             body = next(body for body in self.model.bodies if particle < body.particles.stop)
             raise DivergedError(
                 f"the simulation diverged before t = {self.time:.4g} s: particle {particle - body.particles.start} of "
-                f"'{body.name}' left the finite numbers; lower solver.dt (now {self.scene.dt:.3g} s), or stiffness and "
-                "damping of its material or of a collider"
+                f"'{body.name}' is beyond {diagnostics.MAX_DISTANCE:g} m or {diagnostics.MAX_SPEED:g} m/s; lower "
+                f"solver.dt (now {self.scene.dt:.3g} s), or stiffness and damping of its material or of a collider"
             )
 
-    def first_non_finite(self) -> int | None:
-        """Return the smallest index of a particle that is not at a finite place or speed, None if all are."""
-        self._non_finite.fill_(self.model.particle_count)
-        self._launch(
-            diagnostics.find_non_finite, self.model.particle_count, [self.state.x, self.state.v], [self._non_finite]
-        )
-        first = int(self._non_finite.numpy()[0])
+    def first_lost(self) -> int | None:
+        """Return the smallest index of a particle that is not at a sane place and speed, None if all are."""
+        self._lost.fill_(self.model.particle_count)
+        self._launch(diagnostics.find_lost, self.model.particle_count, [self.state.x, self.state.v], [self._lost])
+        first = int(self._lost.numpy()[0])
         return first if first < self.model.particle_count else None
-
-    def penetrations(self) -> np.ndarray:
-        """Return the greatest depth of a particle of each body in a collider, [body_count], m."""
-        depths = np.zeros(len(self.model.bodies))
-        np.maximum.at(depths, self.model.chunk_body.numpy(), self._measure_chunks()[:, diagnostics.DEPTH])
-        return depths
 
     def diagnostics(self) -> dict[str, Any]:
         """Measure the current state.
@@ -138,7 +135,8 @@ class Simulator:
         Returns:
             ``kinetic``, ``elastic``, ``potential`` (of gravity, zero at the origin) and ``contact`` (in penetrated
             colliders) energy, J; ``momentum`` [3], kg m/s; ``angular_momentum`` [3] about the origin, kg m^2/s;
-            ``max_speed``, m/s; ``max_penetration``, m; ``contacts``, the number of particles in each collider summed.
+            ``max_speed``, m/s; ``penetrations`` [body_count], the greatest depth of a particle of each body in a
+            collider, m; ``contacts``, the number of particles in each collider summed.
         """
         model, state = self.model, self.state
         self._elastic.zero_()
@@ -150,6 +148,8 @@ class Simulator:
         )
         sums = self._measure_chunks()
         total, greatest = sums.sum(axis=0), sums.max(axis=0)
+        penetrations = np.zeros(len(model.bodies))
+        np.maximum.at(penetrations, model.chunk_body.numpy(), sums[:, diagnostics.DEPTH])
         return {
             "kinetic": float(total[diagnostics.KINETIC]),
             "elastic": float(self._elastic.numpy()[0]),
@@ -158,7 +158,7 @@ class Simulator:
             "momentum": total[diagnostics.MOMENTUM :][:3].copy(),
             "angular_momentum": total[diagnostics.ANGULAR_MOMENTUM :][:3].copy(),
             "max_speed": float(greatest[diagnostics.SPEED]),
-            "max_penetration": float(greatest[diagnostics.DEPTH]),
+            "penetrations": penetrations,
             "contacts": int(total[diagnostics.CONTACTS]),
         }
 
@@ -215,10 +215,11 @@ class Simulator:
         )
         return self._sums.numpy()
 
-    def _blocks(self, count: int) -> list[int]:
-        """Cut a number of substeps into those that graphs are captured for: a frame, or a large part of it, and one."""
-        block = min(self.scene.substeps, MAX_CAPTURED_SUBSTEPS)
-        return [block] * (count // block) + [1] * (count % block)
+    def _frame_blocks(self) -> list[int]:
+        """Cut the substeps of a frame into blocks that graphs are captured for, of at most two sizes."""
+        blocks = -(-self.scene.substeps // MAX_CAPTURED_SUBSTEPS)
+        short, longer = divmod(self.scene.substeps, blocks)
+        return [short + 1] * longer + [short] * (blocks - longer)
 
     def _graph(self, substeps: int) -> Any:
         """Return the captured graph of some substeps, None where the device cannot capture."""
@@ -229,9 +230,6 @@ class Simulator:
     def _capture(self, substeps: int) -> Any:
         with _capture_lock:
             try:
-                # Kernels compile at their first launch, which must not happen inside a capture; the constructor has
-                # launched those of the forces.
-                wp.load_module(integrators, device=self.device)
                 with wp.ScopedCapture(device=self.device) as capture:
                     for _ in range(substeps):
                         self._substep()
@@ -245,11 +243,14 @@ class Simulator:
 
     def _substep(self) -> None:
         self._add_forces()
+        self._integrate(self.scene.dt)
+
+    def _integrate(self, dt: float) -> None:
         model, state = self.model, self.state
         self._launch(
             integrators.semi_implicit_euler,
             model.particle_count,
-            [model.particle_inv_mass, state.f, model.real(self.scene.dt)],
+            [model.particle_inv_mass, state.f, model.real(dt)],
             [state.x, state.v],
         )
 
@@ -265,7 +266,7 @@ class Simulator:
             self._launch(springs.add_spring_forces, (len(model.spans), springs.MAX_SPAN), spring_arrays, [state.f])
         if len(model.colliders.kind) == 0:
             return
-        chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else 32
+        chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES
         self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], [self._lower, self._upper])
         self._launch(
             contacts.add_contact_forces,

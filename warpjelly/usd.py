@@ -11,7 +11,6 @@ import json
 import os
 import re
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +18,8 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
 from .colors import COLOR_MAP, LINEAR_TABLE, color_indices
 from .errors import EnvironmentFailedError, InputError
-from .scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider
+from .files import whole_file
+from .scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider, plane_frame
 from .surface import SurfaceFrame, SurfaceMesh
 
 STAGE_NAME = "stage.usdc"
@@ -294,8 +294,7 @@ def _define_colliders(stage: Usd.Stage, scene: Scene, bounds: np.ndarray, rest_c
         if isinstance(collider, PlaneCollider):
             shape = _define_rectangle(stage, path, np.array(collider.center), collider.frame(), collider.size)
         elif isinstance(collider, HalfSpaceCollider):
-            part = PlaneCollider(type="plane", normal=collider.normal, size=(1.0, 1.0))
-            tangent, bitangent, normal = part.frame()
+            tangent, bitangent, normal = plane_frame(collider.normal, None)
             if (rest_center - collider.center) @ normal < 0:
                 # Seen from behind, a wall is culled: its front has to face the bodies.
                 tangent, bitangent, normal = bitangent, tangent, -normal
@@ -417,20 +416,14 @@ def _require_writable(folder: Path) -> None:
 
 def _export(layer: Sdf.Layer, path: Path) -> None:
     """Write a layer to a file that is either complete or, under its final name, not there at all."""
-    unfinished = path.with_name(f"{path.stem}.tmp{path.suffix}")
     try:
-        if not layer.Export(str(unfinished)):
-            raise EnvironmentFailedError(f"{path}: cannot write the stage")
-        with unfinished.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(unfinished, path)
+        with whole_file(path) as unfinished:
+            if not layer.Export(str(unfinished)):
+                raise EnvironmentFailedError(f"{path}: cannot write the stage")
     except Tf.ErrorException as error:
         raise EnvironmentFailedError(f"{path}: cannot write the stage: {_reason(error)}") from error
     except OSError as error:
         raise EnvironmentFailedError(f"{path}: cannot write the stage: {error.strerror}") from error
-    finally:
-        with suppress(OSError):
-            unfinished.unlink(missing_ok=True)
 
 
 def _reason(error: Tf.ErrorException) -> str:
