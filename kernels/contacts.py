@@ -1,7 +1,9 @@
-"""Penalty contact with half-spaces, finite planes and spheres: a spring and a damper along the outward normal.
+"""Penalty contact with half-spaces, finite planes and spheres: a spring and a damper along the normal, and friction.
 
-A box that bodies stay inside is six half-spaces. For a particle at depth d >= 0 with velocity v, the force along the
-unit normal n is max(0, k d - c v.n): without the maximum a particle that leaves would be pulled back.
+A box that bodies stay inside is six half-spaces. Beside the current point, contact looks at where the particle was one
+step earlier: a particle that crossed a plane within the step is caught, however fast, and one that entered a sphere is
+pushed back to where it came in. A contact lasts from step to step; a stamp with the number of the step in which it was
+last seen says so, and goes out of date by itself where culling skips the test.
 """
 
 from typing import Any
@@ -16,6 +18,12 @@ HALF_SPACE = wp.constant(0)
 PLANE = wp.constant(1)
 SPHERE = wp.constant(2)
 
+# Slower than this [m/s] along a surface, a particle rests, and static friction may hold it. It is far below what
+# gravity gives in a millisecond, and far above what rounding leaves of a particle that was stopped.
+REST_SPEED = 1e-4
+# Lanes per chunk where a launch runs in parallel; where it runs one thread after another, one lane is best.
+PARALLEL_LANES = 32
+
 
 def _colliders_struct(real: type) -> Any:
     vector = wp.types.vector(3, real)
@@ -28,13 +36,18 @@ def _colliders_struct(real: type) -> Any:
         bitangent: wp.array(dtype=vector)  # [collider_count] unit; second side of a plane
         normal: wp.array(dtype=vector)  # [collider_count] unit, outward; for a sphere, the direction used at its centre
         size: wp.array(dtype=vector)  # [collider_count] m; plane: half sides and threshold; sphere: radius first
-        lower: wp.array(dtype=vector)  # [collider_count] m; box around a plane's solid part or a sphere
+        lower: wp.array(dtype=vector)  # [collider_count] m; box around a sphere
         upper: wp.array(dtype=vector)  # [collider_count] m
         stiffness: wp.array(dtype=real)  # [collider_count] N/m
         damping: wp.array(dtype=real)  # [collider_count] N s/m
-        side: wp.array2d(
-            dtype=real
-        )  # [collider_count, body_count] -1 where the body is kept behind a half-space, else 1
+        static_friction: wp.array(dtype=real)  # [collider_count] share of the normal reaction
+        dynamic_friction: wp.array(dtype=real)  # [collider_count] share of the normal reaction
+        pulls: wp.array(dtype=wp.int32)  # [collider_count] 1 where the damper may pull a particle that leaves
+        entry_normal: wp.array(dtype=wp.int32)  # [collider_count] 1 for spheres that push back to where one came in
+        normal_force_term: wp.array(dtype=wp.int32)  # [collider_count] 1 to add what presses the particle in
+        applied_friction: wp.array(dtype=wp.int32)  # [collider_count] 1 to take friction from what presses it in
+        slot: wp.array(dtype=wp.int32)  # [collider_count] row of the memory of contacts, -1 without
+        side: wp.array2d(dtype=real)  # [collider_count, body_count] -1 to keep a body behind a half-space, else 1
 
     return Colliders
 
@@ -44,88 +57,293 @@ COLLIDERS = {wp.float32: _colliders_struct(wp.float32), wp.float64: _colliders_s
 
 
 @wp.func
-def contact_normal_and_depth(colliders: Any, c: int, body: int, point: Any):
-    """Return the outward unit normal and the depth of a point in collider c; the depth is negative without contact."""
+def in_rectangle(colliders: Any, c: int, local: Any):
+    """Say whether the projection of a point, relative to the centre, lies in the rectangle of plane c."""
+    size = colliders.size[c]
+    return wp.abs(wp.dot(local, colliders.tangent[c])) <= size[0] and (
+        wp.abs(wp.dot(local, colliders.bitangent[c])) <= size[1]
+    )
+
+
+@wp.func
+def crosses_rectangle(colliders: Any, c: int, start: Any, below: Any, local: Any):
+    """Say whether the segment from start to a point below plane c comes through the rectangle from the front."""
+    zero = type(below)(0.0)
+    before = start - colliders.center[c]
+    above = wp.dot(before, colliders.normal[c])
+    crosses = False
+    if above >= zero:
+        share = zero
+        if above + below > zero:
+            share = above / (above + below)
+        crosses = in_rectangle(colliders, c, before + share * (local - before))
+    return crosses
+
+
+@wp.func
+def entry_normal(radius: Any, before: Any, local: Any):
+    """Return the normal where the segment from before to local, both relative to the centre, enters a sphere."""
+    path = local - before
+    # |before + s path| = radius, the smaller root; before is outside and local inside, so there is one in [0, 1].
+    a = wp.dot(path, path)
+    half_b = wp.dot(before, path)
+    c = wp.dot(before, before) - radius * radius
+    s = (-half_b - wp.sqrt(wp.max(type(radius)(0.0), half_b * half_b - a * c))) / a
+    return wp.normalize(before + s * path)
+
+
+@wp.func
+def find_contact(
+    colliders: Any, c: int, body: int, start: Any, point: Any, held: bool, held_normal: Any, anywhere: bool
+):
+    """Look for a contact of a point with collider c.
+
+    Args:
+        colliders: table of colliders.
+        c: which collider.
+        body: body of the particle.
+        start: where the particle was one step earlier.
+        point: where it is.
+        held: whether it was in contact one step earlier.
+        held_normal: the normal then.
+        anywhere: whether a particle may be in contact without having come through the surface, as at time zero.
+
+    Returns:
+        The outward unit normal; the depth along it, negative without contact; the depth that counts for the force,
+        which ends at a plane's threshold.
+    """
     zero = type(point[0])(0.0)
     local = point - colliders.center[c]
     normal = colliders.side[c, body] * colliders.normal[c]
     depth = type(point[0])(-1.0)
+    counted = depth
     if colliders.kind[c] == SPHERE:
+        radius = colliders.size[c][0]
         distance = wp.length(local)
-        if distance <= colliders.size[c][0]:
-            depth = colliders.size[c][0] - distance
-            if distance > zero:
+        if distance <= radius:
+            before = start - colliders.center[c]
+            if held and colliders.entry_normal[c] == 1:
+                normal = held_normal
+            elif colliders.entry_normal[c] == 1 and wp.length(before) > radius:
+                normal = entry_normal(radius, before, local)
+            elif distance > zero:
                 normal = local / distance
+            along = wp.dot(local, normal)
+            depth = wp.sqrt(wp.max(zero, along * along + (radius - distance) * (radius + distance))) - along
+            counted = depth
     else:
         below = -wp.dot(local, normal)
         if below >= zero:
             if colliders.kind[c] == HALF_SPACE:
                 depth = below
-            else:
-                size = colliders.size[c]
-                inside = (
-                    wp.abs(wp.dot(local, colliders.tangent[c])) <= size[0]
-                    and wp.abs(wp.dot(local, colliders.bitangent[c])) <= size[1]
-                )
-                if inside and below <= size[2]:
+                counted = below
+            elif in_rectangle(colliders, c, local):
+                threshold = colliders.size[c][2]
+                if held or (anywhere and below <= threshold) or crosses_rectangle(colliders, c, start, below, local):
                     depth = below
-    return normal, depth
+                    counted = wp.min(below, threshold)
+    return normal, depth, counted
 
 
 @wp.func
-def contact_force(normal: Any, depth: Any, velocity: Any, stiffness: Any, damping: Any):
-    """Return the force of a penetrated collider on a particle."""
-    push = stiffness * depth - damping * wp.dot(velocity, normal)
-    return wp.max(type(depth)(0.0), push) * normal
+def normal_reaction(colliders: Any, c: int, counted: Any, speed: Any, pressing: Any):
+    """Return the size of the normal force [N]: spring and damper, and what presses the particle in where asked for.
+
+    Args:
+        colliders: table of colliders.
+        c: which collider.
+        counted: depth that counts, m.
+        speed: velocity along the outward normal, m/s.
+        pressing: all other forces against the normal, N, positive inwards.
+    """
+    zero = type(counted)(0.0)
+    push = colliders.stiffness[c] * counted - colliders.damping[c] * speed
+    if colliders.pulls[c] == 0:
+        push = wp.max(zero, push)
+    if colliders.normal_force_term[c] == 1:
+        push += wp.max(zero, pressing)
+    return push
 
 
 @wp.func
-def contact_energy(depth: Any, stiffness: Any):
-    """Return the energy stored in the penetration, whose negative gradient is the undamped force."""
-    return type(depth)(0.5) * stiffness * depth * depth
+def friction_force(
+    colliders: Any, c: int, reaction: Any, pressing: Any, velocity: Any, applied: Any, mass: Any, dt: Any
+):
+    """Return the friction on a particle; velocity and applied (all forces but reactions) are their tangential parts.
+
+    ``stop`` is the force that brings the particle to rest within the step. At rest it is held by that, up to the static
+    limit. Otherwise it slides: the dynamic limit against the motion, but never more than what stops it.
+    """
+    load = wp.abs(reaction)
+    if colliders.applied_friction[c] == 1:
+        load = wp.max(type(mass)(0.0), pressing)
+    limit = colliders.dynamic_friction[c] * load
+    speed = wp.length(velocity)
+    friction = type(mass)(0.0) * velocity
+    if speed < type(mass)(REST_SPEED):
+        stop = -(applied + velocity * (mass / dt))
+        needed = wp.length(stop)
+        if needed <= colliders.static_friction[c] * load:
+            friction = stop
+        else:
+            friction = stop * (wp.min(limit, needed) / needed)
+    else:
+        friction = -velocity * (wp.min(limit, mass * speed / dt) / speed)
+    return friction
+
+
+@wp.func
+def contact_energy(depth: Any, counted: Any, stiffness: Any):
+    """Return the energy of a penetration, whose negative gradient is the undamped force, also past a threshold."""
+    return stiffness * counted * (depth - type(depth)(0.5) * counted)
 
 
 @wp.func
 def may_touch(colliders: Any, c: int, body: int, lower: Any, upper: Any):
-    """Say whether a box may hold a point in contact with collider c; never wrongly no."""
-    if colliders.kind[c] == HALF_SPACE:
-        normal = colliders.side[c, body] * colliders.normal[c]
-        return bounds.least_height(lower, upper, colliders.center[c], normal) <= type(normal[0])(0.0)
-    return bounds.boxes_overlap(lower, upper, colliders.lower[c], colliders.upper[c])
+    """Say whether a box of particles may hold one in contact with collider c; never wrongly no."""
+    zero = type(lower[0])(0.0)
+    if colliders.kind[c] == SPHERE:
+        return bounds.boxes_overlap(lower, upper, colliders.lower[c], colliders.upper[c])
+    center = colliders.center[c]
+    normal = colliders.side[c, body] * colliders.normal[c]
+    touches = bounds.least_height(lower, upper, center, normal) <= zero
+    if touches and colliders.kind[c] == PLANE:
+        # A contact that holds may be anywhere behind the rectangle, so there is no bound on that side.
+        a = colliders.size[c][0] * colliders.tangent[c]
+        b = colliders.size[c][1] * colliders.bitangent[c]
+        touches = (
+            bounds.least_height(lower, upper, center + a, colliders.tangent[c]) <= zero
+            and bounds.least_height(lower, upper, center - a, -colliders.tangent[c]) <= zero
+            and bounds.least_height(lower, upper, center + b, colliders.bitangent[c]) <= zero
+            and bounds.least_height(lower, upper, center - b, -colliders.bitangent[c]) <= zero
+        )
+    return touches
 
 
-# Lanes per chunk where a launch runs in parallel; where it runs one thread after another, one lane is best.
-PARALLEL_LANES = 32
+@wp.func
+def held_contact(colliders: Any, c: int, stamps: wp.array2d(dtype=wp.int32), i: int, step: int):
+    """Say whether particle i was in contact with collider c one step earlier, or has been in this step already."""
+    held = bool(False)
+    if colliders.slot[c] >= 0:
+        held = stamps[colliders.slot[c], i] >= step - 1
+    return held
+
+
+@wp.func
+def held_normal(colliders: Any, c: int, normals: wp.array2d(dtype=Any), i: int):
+    """Return the normal of a contact that holds."""
+    normal = colliders.normal[c]
+    if colliders.entry_normal[c] == 1:
+        row = 3 * colliders.slot[c]
+        normal = wp.vector(normals[row, i], normals[row + 1, i], normals[row + 2, i])
+    return normal
+
+
+@wp.func
+def remember_contact(
+    colliders: Any,
+    c: int,
+    i: int,
+    step: int,
+    normal: Any,
+    stamps: wp.array2d(dtype=wp.int32),
+    normals: wp.array2d(dtype=Any),
+):
+    """Note that particle i is in contact with collider c in this step."""
+    if colliders.slot[c] >= 0:
+        stamps[colliders.slot[c], i] = step
+        if colliders.entry_normal[c] == 1:
+            row = 3 * colliders.slot[c]
+            normals[row, i] = normal[0]
+            normals[row + 1, i] = normal[1]
+            normals[row + 2, i] = normal[2]
+
+
+@wp.func
+def collider_bit(c: int):
+    """Return the bit of a collider in a mask; those beyond the width of the mask share the last one."""
+    return wp.uint32(1) << wp.uint32(wp.min(c, 31))
 
 
 @wp.kernel
 def add_contact_forces(
     # Model:
+    mass: wp.array(dtype=Any),
     chunk_start: wp.array(dtype=wp.int32),
     chunk_body: wp.array(dtype=wp.int32),
     colliders: Any,
     # State in:
     lower: wp.array2d(dtype=Any),
     upper: wp.array2d(dtype=Any),
+    x_start: wp.array2d(dtype=Any),
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
+    step: wp.array(dtype=wp.int32),
     # In:
+    dt: Any,
+    loss_weight: Any,
+    first: bool,
     culling: bool,
     lanes: int,
-    # State out:
+    # State in and out:
+    stamps: wp.array2d(dtype=wp.int32),
+    normals: wp.array2d(dtype=Any),
     f: wp.array2d(dtype=Any),
+    losses: wp.array2d(dtype=wp.float64),
 ):
-    """Add the contact forces, launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk."""
+    """Add the contact forces, launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk.
+
+    The first evaluation of a step remembers contacts; those of later stages look at trial positions only. Losses
+    [2, chunk_count] gain the power of contact damping and of friction times loss_weight.
+    """
     chunk, lane = wp.tid()
     body = chunk_body[chunk]
     low = vectors.load(lower, chunk)
     high = vectors.load(upper, chunk)
+    now = step[0]
+    near = wp.uint32(0)
     for c in range(colliders.kind.shape[0]):
         if not culling or may_touch(colliders, c, body, low, high):
-            for i in range(chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes):
-                normal, depth = contact_normal_and_depth(colliders, c, body, vectors.load(x, i))
-                if depth >= type(depth)(0.0):
-                    force = contact_force(
-                        normal, depth, vectors.load(v, i), colliders.stiffness[c], colliders.damping[c]
+            near |= collider_bit(c)
+    if near == wp.uint32(0):
+        return
+    damped = wp.float64(0.0)
+    rubbed = wp.float64(0.0)
+    for i in range(chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes):
+        point = vectors.load(x, i)
+        start = vectors.load(x_start, i)
+        total = type(dt)(0.0) * point
+        touches = bool(False)
+        for c in range(colliders.kind.shape[0]):
+            if near & collider_bit(c) != wp.uint32(0):
+                held = held_contact(colliders, c, stamps, i, now)
+                before = held_normal(colliders, c, normals, i)
+                normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, now == 0)
+                if depth >= type(dt)(0.0):
+                    touches = True
+                    if first:
+                        remember_contact(colliders, c, i, now, normal, stamps, normals)
+                    velocity = vectors.load(v, i)
+                    speed = wp.dot(velocity, normal)
+                    # Without the other colliders' reactions, so that their order does not matter.
+                    applied = vectors.load(f, i)
+                    pressing = -wp.dot(applied, normal)
+                    reaction = normal_reaction(colliders, c, counted, speed, pressing)
+                    friction = friction_force(
+                        colliders,
+                        c,
+                        reaction,
+                        pressing,
+                        velocity - speed * normal,
+                        applied + pressing * normal,
+                        mass[i],
+                        dt,
                     )
-                    vectors.store(f, i, vectors.load(f, i) + force)
+                    total += reaction * normal + friction
+                    damped -= wp.float64((reaction - colliders.stiffness[c] * counted) * speed)
+                    rubbed -= wp.float64(wp.dot(friction, velocity))
+        # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
+        if touches:
+            vectors.store(f, i, vectors.load(f, i) + total)
+    wp.atomic_add(losses, 0, chunk, wp.float64(loss_weight) * damped)
+    wp.atomic_add(losses, 1, chunk, wp.float64(loss_weight) * rubbed)

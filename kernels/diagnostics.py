@@ -63,8 +63,12 @@ def measure_chunks(
     chunk_body: wp.array(dtype=wp.int32),
     colliders: Any,
     # State in:
+    x_start: wp.array2d(dtype=Any),
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
+    step: wp.array(dtype=wp.int32),
+    stamps: wp.array2d(dtype=wp.int32),
+    normals: wp.array2d(dtype=Any),
     # Out:
     sums: wp.array2d(dtype=wp.float64),
 ):
@@ -90,9 +94,13 @@ def measure_chunks(
         angular += m * wp.cross(p, u)
         greatest_speed = wp.max(greatest_speed, wp.length(u))
         for c in range(colliders.kind.shape[0]):
-            _normal, depth = contacts.contact_normal_and_depth(colliders, c, chunk_body[chunk], point)
+            held = contacts.held_contact(colliders, c, stamps, i, step[0])
+            before = contacts.held_normal(colliders, c, normals, i)
+            _normal, depth, counted = contacts.find_contact(
+                colliders, c, chunk_body[chunk], vectors.load(x_start, i), point, held, before, step[0] == 0
+            )
             if depth >= type(depth)(0.0):
-                stored += wp.float64(contacts.contact_energy(depth, colliders.stiffness[c]))
+                stored += wp.float64(contacts.contact_energy(depth, counted, colliders.stiffness[c]))
                 greatest_depth = wp.max(greatest_depth, wp.float64(depth))
                 touching += wp.float64(1.0)
     sums[chunk, KINETIC] = kinetic

@@ -30,6 +30,13 @@ def spring_force(offset: Any, velocity: Any, rest: Any, stiffness: Any, damping:
 
 
 @wp.func
+def damping_power(offset: Any, velocity: Any, damping: Any):
+    """Return the power [W] that the damper takes from the motion."""
+    approach = wp.dot(velocity, wp.normalize(offset))
+    return damping * approach * approach
+
+
+@wp.func
 def spring_energy(offset: Any, rest: Any, stiffness: Any):
     """Return the elastic energy, whose negative gradient is the undamped force."""
     stretch = wp.length(offset) - rest
@@ -44,10 +51,16 @@ def add_spring_forces(
     # State in:
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
+    # In:
+    loss_weight: Any,
     # State out:
     f: wp.array2d(dtype=Any),
+    losses: wp.array(dtype=wp.float64),
 ):
-    """Add the forces of the springs, one thread per spring; launched over (span, lane)."""
+    """Add the forces of the springs, one thread per spring; launched over (span, lane).
+
+    Losses [span_count] gain the power of the dampers times loss_weight.
+    """
     index, lane = wp.tid()
     span = spans[index]
     if lane >= span[2]:
@@ -60,6 +73,7 @@ def add_spring_forces(
     force = spring_force(offset, velocity, c[0], c[1], c[2])
     vectors.add(f, i, force)
     vectors.add(f, j, -force)
+    wp.atomic_add(losses, index, wp.float64(loss_weight * damping_power(offset, velocity, c[2])))
 
 
 # The same law for a whole span on the CPU, in three passes that the compiler turns into vector instructions. It could
@@ -79,7 +93,7 @@ def add_spring_forces(
     const real* __restrict qu = v.data + j;
     const real* __restrict qv = qu + v.shape[1];
     const real* __restrict qw = qv + v.shape[1];
-    real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}];
+    real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}], power[{MAX_SPAN}];
     for (int s = 0; s < count; ++s) {{
         real dx = qx[s] - px[s], dy = qy[s] - py[s], dz = qz[s] - pz[s];
         real du = qu[s] - pu[s], dv = qv[s] - pv[s], dw = qw[s] - pw[s];
@@ -96,6 +110,7 @@ def add_spring_forces(
         gx[s] = scale * dx;
         gy[s] = scale * dy;
         gz[s] = scale * dz;
+        power[s] = damping * approach * approach;
     }}
     real* __restrict fx = f.data + i;
     real* __restrict fy = fx + f.shape[1];
@@ -105,17 +120,27 @@ def add_spring_forces(
     fy += j - i;
     fz += j - i;
     for (int s = 0; s < count; ++s) {{ fx[s] -= gx[s]; fy[s] -= gy[s]; fz[s] -= gz[s]; }}
+    // Eight sums at once: a single one would wait for each addition in turn.
+    real sums[8] = {{}};
+    int s = 0;
+    for (; s + 8 <= count; s += 8) for (int k = 0; k < 8; ++k) sums[k] += power[s + k];
+    for (int k = 0; s < count; ++s, ++k) sums[k] += power[s];
+    real total = ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]));
+    losses.data[span] += double(loss_weight * total);
 """)
 def _add_span(
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
     f: wp.array2d(dtype=Any),
+    losses: wp.array(dtype=wp.float64),
+    span: int,
     i: int,
     j: int,
     count: int,
     rest: Any,
     stiffness: Any,
     damping: Any,
+    loss_weight: Any,
 ): ...
 
 
@@ -127,10 +152,14 @@ def add_span_forces(
     # State in:
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
+    # In:
+    loss_weight: Any,
     # State out:
     f: wp.array2d(dtype=Any),
+    losses: wp.array(dtype=wp.float64),
 ):
     """Add the forces of the springs, one thread per span; for the CPU, where spans run one after another."""
-    span = spans[wp.tid()]
+    index = wp.tid()
+    span = spans[index]
     c = classes[span[3]]
-    _add_span(x, v, f, span[0], span[1], span[2], c[0], c[1], c[2])
+    _add_span(x, v, f, losses, index, span[0], span[1], span[2], c[0], c[1], c[2], loss_weight)

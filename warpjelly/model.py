@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import contacts, springs
+from warpjelly.kernels import bounds, contacts, springs
 
 from .lattice import REST_LENGTHS, Lattice, build_lattice
 from .plan import BodyPlan, Plan
@@ -17,8 +17,6 @@ from .scene import DEFAULT_PARTICLE_MASS, AnyCollider, BoxCollider, Material, Pl
 
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
-# Collider volumes are grown by this share of 1 m plus their distance from the origin, for the reason in bounds.MARGIN.
-VOLUME_MARGIN = 1e-5
 
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
 
@@ -78,6 +76,18 @@ class State:
     """Velocities, m/s."""
     f: wp.array
     """Total forces, N."""
+    x_start: wp.array
+    """Positions at the start of the step, m; before it, at the start of the last one."""
+    step: wp.array
+    """Steps since the start, int32 [1]."""
+    stamps: wp.array
+    """Step in which a particle was last in contact with a plane or a sphere, int32 [slot_count, particle_count]."""
+    normals: wp.array
+    """Normals of those contacts for spheres that remember them, real [3 slot_count, particle_count]."""
+    spring_losses: wp.array
+    """Energy taken by the dampers of each span, float64 [span_count], J."""
+    contact_losses: wp.array
+    """Energy taken by contact damping and by friction in each chunk, float64 [2, chunk_count], J."""
 
 
 def build(plan: Plan, *, device: str) -> tuple[Model, State]:
@@ -146,11 +156,19 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         surface_particles=array(np.concatenate(surface_particles), wp.int32),
         surface_quads=array(np.concatenate(surface_quads), wp.vec4i),
     )
+    slots = int(model.colliders.slot.numpy().max(initial=-1)) + 1
+    remembered = int(model.colliders.entry_normal.numpy().sum())
     # Rows per component: see kernels/__init__.py.
     state = State(
         x=array(np.ascontiguousarray(x.T), real),
         v=array(np.ascontiguousarray(v.T), real),
         f=wp.zeros((3, particle_count), dtype=real, device=device),
+        x_start=array(np.ascontiguousarray(x.T), real),
+        step=wp.zeros(1, dtype=wp.int32, device=device),
+        stamps=wp.full((slots, particle_count), -2, dtype=wp.int32, device=device),
+        normals=wp.zeros((3 * remembered, particle_count), dtype=real, device=device),
+        spring_losses=wp.zeros(len(model.spans), dtype=wp.float64, device=device),
+        contact_losses=wp.zeros((2, len(model.chunk_body)), dtype=wp.float64, device=device),
     )
     return model, state
 
@@ -219,9 +237,15 @@ def _place(lattice: Lattice, mass: np.ndarray, plan: BodyPlan) -> tuple[np.ndarr
 def _colliders(scene: Scene, centers_of_mass: Sequence[np.ndarray], real: type, device: str) -> Any:
     """Return the table of colliders for the kernels."""
     rows = [row for collider in scene.colliders for row in _collider_rows(collider, scene, centers_of_mass)]
+    # Spheres that remember normals have the first slots of the memory, so that only they need rows for them.
+    with_memory = [row for row in rows if row["entry_normal"]] + [row for row in rows if row["kind"] == contacts.PLANE]
+    for row in rows:
+        row["slot"] = next((slot for slot, other in enumerate(with_memory) if other is row), -1)
     vector = wp.types.vector(3, real)
     table = contacts.COLLIDERS[real]()
-    for name, dtype in [("kind", wp.int32), ("stiffness", real), ("damping", real)]:
+    numbers = ("stiffness", "damping", "static_friction", "dynamic_friction")
+    flags = ("kind", "pulls", "entry_normal", "normal_force_term", "applied_friction", "slot")
+    for name, dtype in [(name, real) for name in numbers] + [(name, wp.int32) for name in flags]:
         setattr(table, name, wp.array(np.array([row[name] for row in rows]), dtype=dtype, device=device))
     for name in ("center", "tangent", "bitangent", "normal", "size", "lower", "upper"):
         data = np.array([row.get(name, np.zeros(3)) for row in rows], float).reshape(-1, 3)
@@ -235,20 +259,27 @@ def _collider_rows(collider: AnyCollider, scene: Scene, centers_of_mass: Sequenc
     """Return the members of the table of kernels/contacts.py for one collider of the scene."""
     center = np.array(collider.center)
     everywhere = np.ones(len(centers_of_mass))
-    row = {"center": center, "stiffness": collider.stiffness, "damping": collider.damping, "side": everywhere}
+    defaults = scene.contact
+    row: dict[str, Any] = {"center": center, "side": everywhere, "entry_normal": False}
+    for name in ("stiffness", "damping", "static_friction", "dynamic_friction", "pulls"):
+        own = getattr(collider, name)
+        row[name] = getattr(defaults, name) if own is None else own
+    row["normal_force_term"] = defaults.normal_force_term
+    row["applied_friction"] = defaults.friction_normal == "applied"
     if isinstance(collider, SphereCollider):
         radius = np.full(3, collider.radius)
         up = np.eye(3)[scene.up]
-        return [row | {"kind": contacts.SPHERE, "normal": up, "size": radius} | _volume(center, radius)]
+        # The box that culling tests, grown so that rounding never makes it too small.
+        reach = radius + bounds.MARGIN * (1.0 + np.abs(center) + radius)
+        volume = {"lower": center - reach, "upper": center + reach}
+        entry = {"entry_normal": collider.normal == "entry"}
+        return [row | entry | {"kind": contacts.SPHERE, "normal": up, "size": radius} | volume]
     if isinstance(collider, PlaneCollider):
         tangent, bitangent, normal = collider.frame()
         a, b = np.array(collider.size) / 2
-        # The solid part is a block from the front down to the threshold.
-        middle = center - normal * collider.threshold / 2
-        reach = np.abs([a * tangent, b * bitangent, normal * collider.threshold / 2]).sum(axis=0)
         directions = {"tangent": tangent, "bitangent": bitangent, "normal": normal}
         size = {"size": [a, b, collider.threshold]}
-        return [row | {"kind": contacts.PLANE} | directions | size | _volume(middle, reach)]
+        return [row | {"kind": contacts.PLANE} | directions | size]
     if isinstance(collider, BoxCollider):
         walls = []
         for axis in range(3):
@@ -260,9 +291,3 @@ def _collider_rows(collider: AnyCollider, scene: Scene, centers_of_mass: Sequenc
     normal = np.array(collider.normal) / np.linalg.norm(collider.normal)
     side = [-1.0 if (com - center) @ normal < 0 else 1.0 for com in centers_of_mass]
     return [row | {"kind": contacts.HALF_SPACE, "normal": normal, "side": side}]
-
-
-def _volume(center: np.ndarray, reach: np.ndarray) -> dict[str, np.ndarray]:
-    """Return the box around a collider, grown so that rounding never makes it too small."""
-    margin = VOLUME_MARGIN * (1.0 + np.abs(center) + reach)
-    return {"lower": center - reach - margin, "upper": center + reach + margin}

@@ -74,7 +74,9 @@ class Table(BaseModel):
 class Solver(Table):
     """How time advances."""
 
-    integrator: Literal["semi_implicit_euler"] = Field("semi_implicit_euler", description="time integration scheme")
+    integrator: Literal["explicit_euler", "semi_implicit_euler", "rk2", "rk4"] = Field(
+        "semi_implicit_euler", description="time integration scheme; rk2 is the midpoint rule, rk4 the classical one"
+    )
     dt: float = Field(
         1e-3,
         strict=True,
@@ -189,12 +191,32 @@ class ModelBody(Body):
         return file
 
 
+class Contact(Table):
+    """How colliders push back, unless they say otherwise themselves; all per particle in contact."""
+
+    stiffness: Positive = Field(2000.0, description="N/m of penetration depth")
+    damping: NotNegative = Field(1.0, description="N s/m along the normal")
+    static_friction: NotNegative = Field(0.6, description="largest friction at rest, share of the normal force")
+    dynamic_friction: NotNegative = Field(0.4, description="friction in motion, share of the normal force")
+    pulls: Switch = Field(False, description="let the damper also pull a particle that leaves")
+    normal_force_term: Switch = Field(
+        False,
+        description="add what presses a particle in, so that it does not sink; feeds energy, and bodies bounce higher",
+    )
+    friction_normal: Literal["reaction", "applied"] = Field(
+        "reaction", description="friction is a share of the collider's force, or of what presses the particle in"
+    )
+
+
 class Collider(Table):
-    """What all colliders have: a name and a penalty spring."""
+    """What all colliders have: a name, and what they do otherwise than [contact]."""
 
     name: Name | None = Field(None, description="prim name in the stage; the type and a number unless given")
-    stiffness: Positive = Field(2000.0, description="N/m of penetration depth, per particle")
-    damping: NotNegative = Field(1.0, description="N s/m along the normal, per particle; the contact never pulls")
+    stiffness: Positive | None = Field(None, description="N/m of penetration depth, per particle")
+    damping: NotNegative | None = Field(None, description="N s/m along the normal, per particle")
+    static_friction: NotNegative | None = Field(None, description="largest friction at rest, share of the normal force")
+    dynamic_friction: NotNegative | None = Field(None, description="friction in motion, share of the normal force")
+    pulls: Switch | None = Field(None, description="let the damper also pull a particle that leaves")
 
 
 def _require_direction(vector: tuple[float, float, float], what: str) -> None:
@@ -216,14 +238,14 @@ class HalfSpaceCollider(Collider):
 
 
 class PlaneCollider(Collider):
-    """A rectangle, solid from its front down to the threshold behind it."""
+    """A rectangle that stops what comes through it from the front."""
 
     type: Literal["plane"]
     center: Point = Field((0.0, 0.0, 0.0), description="m")
     normal: Vector = Field(description="points out of the front; any length")
     tangent: Vector | None = Field(None, description="direction of the first side; chosen unless given")
     size: tuple[Length, Length] = Field(description="both sides, m")
-    threshold: Length = Field(0.1, description="depth behind the plane down to which it acts, m")
+    threshold: Length = Field(0.1, description="depth beyond which the force does not grow, m")
 
     @model_validator(mode="after")
     def _directions_span_the_plane(self) -> Self:
@@ -261,6 +283,9 @@ class SphereCollider(Collider):
     type: Literal["sphere"]
     center: Point = Field((0.0, 0.0, 0.0), description="m")
     radius: Length = Field(description="m")
+    normal: Literal["radial", "entry"] = Field(
+        "radial", description="push straight out, or towards where the particle came in"
+    )
 
 
 class BoxCollider(Collider):
@@ -345,6 +370,7 @@ class Scene(Table):
     solver: Solver = Field(Solver(), description="time integration")
     materials: dict[Name, Material] = Field(min_length=1, description="materials by name")
     bodies: list[AnyBody] = Field(min_length=1, description="what is made of jelly")
+    contact: Contact = Field(Contact(), description="how colliders push back unless they say otherwise")
     colliders: list[AnyCollider] = Field([], description="what the bodies collide with")
     output: Output = Field(Output(), description="what is written")
     expect: Expect = Field(Expect(), description="what the scene is for, as numbers")

@@ -51,6 +51,11 @@ class Simulator:
         chunk_count = len(self.model.chunk_body)
         point_count = len(self.model.surface_particles)
         with wp.ScopedDevice(self.device):
+            # What only Runge-Kutta schemes need between their stages.
+            scratch = self.scene.solver.integrator in integrators.STAGES
+            self._v_start, self._x_sum, self._v_sum = (
+                wp.zeros_like(self.state.v) if scratch else None for _ in range(3)
+            )
             self._lower = wp.zeros((3, chunk_count), dtype=self.model.real)
             self._upper = wp.zeros((3, chunk_count), dtype=self.model.real)
             self._lost = wp.zeros(1, dtype=wp.int32)
@@ -63,8 +68,11 @@ class Simulator:
         self._graphs: dict[int, Any] = {}
         self._capturable = True
         # Kernels compile at their first launch, which must not be inside a capture; a step of no time changes nothing.
-        self._add_forces()
-        self._integrate(0.0)
+        self._add_forces(loss_weight=0.0)
+        if scratch:
+            self._integrate_stage(0.0, 0.0, 0.0, first=True, last=True)
+        else:
+            self._integrate(0.0)
 
     @property
     def time(self) -> float:
@@ -134,7 +142,9 @@ class Simulator:
 
         Returns:
             ``kinetic``, ``elastic``, ``potential`` (of gravity, zero at the origin) and ``contact`` (in penetrated
-            colliders) energy, J; ``momentum`` [3], kg m/s; ``angular_momentum`` [3] about the origin, kg m^2/s;
+            colliders) energy, and what ``spring_losses`` (dampers), ``contact_losses`` (damping of contacts) and
+            ``friction_losses`` took since the start, J; together they keep their sum, to the order of the scheme;
+            ``momentum`` [3], kg m/s; ``angular_momentum`` [3] about the origin, kg m^2/s;
             ``max_speed``, m/s; ``penetrations`` [body_count], the greatest depth of a particle of each body in a
             collider, m; ``contacts``, the number of particles in each collider summed.
         """
@@ -148,6 +158,7 @@ class Simulator:
         )
         sums = self._measure_chunks()
         total, greatest = sums.sum(axis=0), sums.max(axis=0)
+        contact_losses = self.state.contact_losses.numpy().sum(axis=1)
         penetrations = np.zeros(len(model.bodies))
         np.maximum.at(penetrations, model.chunk_body.numpy(), sums[:, diagnostics.DEPTH])
         return {
@@ -155,6 +166,9 @@ class Simulator:
             "elastic": float(self._elastic.numpy()[0]),
             "potential": float(total[diagnostics.POTENTIAL]),
             "contact": float(total[diagnostics.CONTACT]),
+            "spring_losses": float(self.state.spring_losses.numpy().sum()),
+            "contact_losses": float(contact_losses[0]),
+            "friction_losses": float(contact_losses[1]),
             "momentum": total[diagnostics.MOMENTUM :][:3].copy(),
             "angular_momentum": total[diagnostics.ANGULAR_MOMENTUM :][:3].copy(),
             "max_speed": float(greatest[diagnostics.SPEED]),
@@ -208,8 +222,12 @@ class Simulator:
                 model.chunk_start,
                 model.chunk_body,
                 model.colliders,
+                state.x_start,
                 state.x,
                 state.v,
+                state.step,
+                state.stamps,
+                state.normals,
             ],
             [self._sums],
         )
@@ -242,8 +260,16 @@ class Simulator:
         return capture.graph
 
     def _substep(self) -> None:
-        self._add_forces()
-        self._integrate(self.scene.dt)
+        if self.scene.solver.integrator == "semi_implicit_euler":
+            self._add_forces(loss_weight=self.scene.dt)
+            self._integrate(self.scene.dt)
+        else:
+            stages = integrators.STAGES[self.scene.solver.integrator]
+            for number, (_share, weight, reach) in enumerate(stages):
+                first, last = number == 0, number == len(stages) - 1
+                self._add_forces(loss_weight=weight * self.scene.dt, first=first)
+                self._integrate_stage(self.scene.dt, weight, reach, first=first, last=last)
+        self._launch(integrators.count_step, 1, [], [self.state.step])
 
     def _integrate(self, dt: float) -> None:
         model, state = self.model, self.state
@@ -251,19 +277,37 @@ class Simulator:
             integrators.semi_implicit_euler,
             model.particle_count,
             [model.particle_inv_mass, state.f, model.real(dt)],
-            [state.x, state.v],
+            [state.x_start, state.x, state.v],
         )
 
-    def _add_forces(self) -> None:
-        """Overwrite the forces with those at the current positions and velocities."""
+    def _integrate_stage(self, dt: float, weight: float, reach: float, *, first: bool, last: bool) -> None:
+        model, state = self.model, self.state
+        real = model.real
+        self._launch(
+            integrators.runge_kutta_stage,
+            model.particle_count,
+            [model.particle_inv_mass, state.f, real(dt), real(weight), real(reach), first, last],
+            [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
+        )
+
+    def _add_forces(self, *, loss_weight: float, first: bool = True) -> None:
+        """Overwrite the forces with those at the current positions and velocities.
+
+        Args:
+            loss_weight: what the power of dampers and friction counts for in the losses, s.
+            first: whether this is the first evaluation of a step, which remembers contacts.
+        """
         model, state = self.model, self.state
         on_cpu = self.device == "cpu"
+        weight = model.real(loss_weight)
         self._launch(fields.set_gravity_forces, model.particle_count, [model.particle_mass, model.gravity], [state.f])
-        spring_arrays = [model.spans, model.spring_classes, state.x, state.v]
+        spring_inputs = [model.spans, model.spring_classes, state.x, state.v, weight]
+        spring_outputs = [state.f, state.spring_losses]
         if on_cpu:
-            self._launch(springs.add_span_forces, len(model.spans), spring_arrays, [state.f])
+            self._launch(springs.add_span_forces, len(model.spans), spring_inputs, spring_outputs)
         else:
-            self._launch(springs.add_spring_forces, (len(model.spans), springs.MAX_SPAN), spring_arrays, [state.f])
+            threads = (len(model.spans), springs.MAX_SPAN)
+            self._launch(springs.add_spring_forces, threads, spring_inputs, spring_outputs)
         if len(model.colliders.kind) == 0:
             return
         chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES
@@ -272,9 +316,9 @@ class Simulator:
             contacts.add_contact_forces,
             (chunk_count, lanes),
             [
-                *(model.chunk_start, model.chunk_body, model.colliders),
-                *(self._lower, self._upper, state.x, state.v),
-                *(self.scene.solver.culling, lanes),
+                *(model.particle_mass, model.chunk_start, model.chunk_body, model.colliders),
+                *(self._lower, self._upper, state.x_start, state.x, state.v, state.step),
+                *(model.real(self.scene.dt), weight, first, self.scene.solver.culling, lanes),
             ],
-            [state.f],
+            [state.stamps, state.normals, state.f, state.contact_losses],
         )
