@@ -1,7 +1,8 @@
 """Penalty contact with half-spaces, finite planes and spheres: a spring and a damper along the outward normal.
 
 A box that bodies stay inside is six half-spaces. For a particle at depth d >= 0 with velocity v, the force along the
-unit normal n is max(0, k d - c v.n): without the maximum a particle that leaves would be pulled back.
+unit normal n is max(0, k d - c v.n): without the maximum a particle that leaves would be pulled back, which happens
+only where a collider asks for it.
 """
 
 from typing import Any
@@ -32,6 +33,7 @@ def _colliders_struct(real: type) -> Any:
         upper: wp.array(dtype=vector)  # [collider_count] m
         stiffness: wp.array(dtype=real)  # [collider_count] N/m
         damping: wp.array(dtype=real)  # [collider_count] N s/m
+        pulls: wp.array(dtype=wp.int32)  # [collider_count] 1 where the force may point inwards, too
         side: wp.array2d(
             dtype=real
         )  # [collider_count, body_count] -1 where the body is kept behind a half-space, else 1
@@ -73,10 +75,12 @@ def contact_normal_and_depth(colliders: Any, c: int, body: int, point: Any):
 
 
 @wp.func
-def contact_force(normal: Any, depth: Any, velocity: Any, stiffness: Any, damping: Any):
+def contact_force(normal: Any, depth: Any, velocity: Any, stiffness: Any, damping: Any, pulls: int):
     """Return the force of a penetrated collider on a particle."""
     push = stiffness * depth - damping * wp.dot(velocity, normal)
-    return wp.max(type(depth)(0.0), push) * normal
+    if pulls == 0:
+        push = wp.max(type(depth)(0.0), push)
+    return push * normal
 
 
 @wp.func
@@ -122,6 +126,11 @@ def add_contact_forces(
                 normal, depth = contact_normal_and_depth(colliders, c, body, vectors.load(x, i))
                 if depth >= type(depth)(0.0):
                     force = contact_force(
-                        normal, depth, vectors.load(v, i), colliders.stiffness[c], colliders.damping[c]
+                        normal,
+                        depth,
+                        vectors.load(v, i),
+                        colliders.stiffness[c],
+                        colliders.damping[c],
+                        colliders.pulls[c],
                     )
                     vectors.store(f, i, vectors.load(f, i) + force)

@@ -12,7 +12,7 @@ import warp as wp
 from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, springs, surfaces
 
 from .device import choose_device
-from .errors import DivergedError
+from .errors import DivergedError, InputError
 from .model import Model, State, build
 from .plan import Plan, plan_scene
 from .scene import Scene
@@ -40,6 +40,8 @@ class Simulator:
     def __init__(self, scene: Scene | Plan, *, device: str = "auto") -> None:
         plan = scene if isinstance(scene, Plan) else plan_scene(scene)
         self.scene = plan.scene
+        if self.scene.solver.integrator != "semi_implicit_euler":
+            raise InputError(f"solver.integrator = {self.scene.solver.integrator!r}: not there yet")
         self.device = choose_device(device)
         self.model: Model
         self.state: State
@@ -232,6 +234,7 @@ class Simulator:
                 # Kernels compile at their first launch, which must not happen inside a capture; the constructor has
                 # launched those of the forces.
                 wp.load_module(integrators, device=self.device)
+                wp.load_module(fields, device=self.device)
                 with wp.ScopedCapture(device=self.device) as capture:
                     for _ in range(substeps):
                         self._substep()
@@ -252,12 +255,24 @@ class Simulator:
             [model.particle_inv_mass, state.f, model.real(self.scene.dt)],
             [state.x, state.v],
         )
+        if self.scene.fields:
+            self._launch(fields.count_step, 1, [], [state.step])
 
-    def _add_forces(self) -> None:
-        """Overwrite the forces with those at the current positions and velocities."""
+    def _add_forces(self, offset: float = 0.0) -> None:
+        """Overwrite the forces with those at the current positions and velocities, offset [s] into the step."""
         model, state = self.model, self.state
         on_cpu = self.device == "cpu"
         self._launch(fields.set_gravity_forces, model.particle_count, [model.particle_mass, model.gravity], [state.f])
+        if self.scene.fields:
+            self._launch(
+                fields.add_field_forces,
+                model.particle_count,
+                [
+                    *(model.particle_charge, model.fields, state.step, state.x, state.v),
+                    *(wp.float64(self.scene.dt), wp.float64(offset)),
+                ],
+                [state.f],
+            )
         spring_arrays = [model.spans, model.spring_classes, state.x, state.v]
         if on_cpu:
             self._launch(springs.add_span_forces, len(model.spans), spring_arrays, [state.f])
