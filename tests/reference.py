@@ -148,26 +148,26 @@ def contact_force(collider: Any, point: np.ndarray, velocity: np.ndarray, start:
     return force
 
 
-def grid_force(field: Any, point: np.ndarray) -> np.ndarray:
-    """Sum the forces of all nodes of a grid, each weighted with its tent functions along x, y and z."""
+def grid_force(field: Any, points: np.ndarray) -> np.ndarray:
+    """Sum the forces of all nodes of a grid, each weighted with its tent functions along x, y and z, [count, 3]."""
     nodes, lower, upper = field.nodes(), np.array(field.lower), np.array(field.upper)
-    if field.outside == "zero" and not all((lower <= point) & (point <= upper)):
-        return np.zeros(3)
-    place = (np.clip(point, lower, upper) - lower) / (upper - lower) * (len(nodes) - 1)
-    tents = np.maximum(0.0, 1.0 - np.abs(np.arange(len(nodes)) - place[:, None]))
-    return np.einsum("i,j,k,ijkc->c", *tents, nodes)
+    place = (np.clip(points, lower, upper) - lower) / (upper - lower) * (len(nodes) - 1)
+    tents = np.maximum(0.0, 1.0 - np.abs(np.arange(len(nodes)) - place.T[:, :, None]))
+    force = np.einsum("ni,nj,nk,ijkc->nc", *tents, nodes, optimize=True)
+    inside = ((lower <= points) & (points <= upper)).all(axis=1)
+    return force if field.outside == "clamp" else force * inside[:, None]
 
 
-def field_force(field: Any, point: np.ndarray, velocity: np.ndarray, charge: float, time: float) -> np.ndarray:
-    """Return the force of a field on a particle at a time: its law times its curve."""
+def field_force(field: Any, x: np.ndarray, v: np.ndarray, charge: np.ndarray, time: float) -> np.ndarray:
+    """Return the force of a field on particles at a time, [count, 3]: its law times its curve."""
     factor = 1.0 if field.curve is None else np.interp(time, *zip(*field.curve, strict=True))
     if field.type == "grid":
-        return factor * grid_force(field, point)
+        return factor * grid_force(field, x)
     if field.type == "electric":
-        return factor * charge * np.array(field.strength)
+        return factor * np.outer(charge, field.strength)
     if field.type == "magnetic":
-        return factor * charge * np.cross(velocity, field.strength)
-    return factor * np.array(field.force)
+        return factor * charge[:, None] * np.cross(v, field.strength)
+    return factor * np.tile(field.force, (len(x), 1))
 
 
 def contact_energy(collider: Any, point: np.ndarray, start: np.ndarray, up: int = 1) -> float:
@@ -233,8 +233,9 @@ class World:
         f += spring_forces(self.x, self.v, self.ends, self.rest, self.k, self.d)
         for collider, (i, body) in itertools.product(self.scene.colliders, enumerate(self.body)):
             f[i] += contact_force(collider, self.x[i], self.v[i], self.starts[body], self.scene.up)
-        for field, (i, body) in itertools.product(self.scene.fields, enumerate(self.body)):
-            f[i] += field_force(field, self.x[i], self.v[i], self.scene.bodies[body].charge, self.steps * self.dt)
+        charge = np.array([self.scene.bodies[body].charge for body in self.body])
+        for field in self.scene.fields:
+            f += field_force(field, self.x, self.v, charge, self.steps * self.dt)
         return f
 
     def step(self, count: int = 1) -> None:

@@ -79,6 +79,10 @@ class Solver(Table):
         allow_inf_nan=False,
         description="largest time step, s; the step used is the largest one below it that divides a frame",
     )
+    precision: Literal["float32", "float64"] = Field("float32", description="floating-point type of the simulation")
+    culling: Switch = Field(
+        True, description="skip contact tests of particles whose bounding box is clear; same result"
+    )
     steps_per_frame: int | None = Field(
         None,
         strict=True,
@@ -86,10 +90,6 @@ class Solver(Table):
         le=MAX_SUBSTEPS,
         description="take exactly this many steps of exactly dt between samples; fps is then 1 / (dt * steps) and best "
         "left out. Unless given, dt adapts to fps",
-    )
-    precision: Literal["float32", "float64"] = Field("float32", description="floating-point type of the simulation")
-    culling: Switch = Field(
-        True, description="skip contact tests of particles whose bounding box is clear; same result"
     )
 
 
