@@ -221,11 +221,12 @@ def may_touch(colliders: Any, c: int, body: int, lower: Any, upper: Any):
 
 
 @wp.func
-def held_contact(colliders: Any, c: int, stamps: wp.array2d(dtype=wp.int32), i: int, step: int):
+def held_contact(colliders: Any, c: int, stamps: wp.array2d(dtype=wp.int32), i: int, step: wp.int64):
     """Say whether particle i was in contact with collider c one step earlier, or has been in this step already."""
     held = bool(False)
     if colliders.slot[c] >= 0:
-        held = stamps[colliders.slot[c], i] >= step - 1
+        stamp = stamps[colliders.slot[c], i]
+        held = stamp == wp.int32(step) or stamp == wp.int32(step - wp.int64(1))
     return held
 
 
@@ -244,14 +245,14 @@ def remember_contact(
     colliders: Any,
     c: int,
     i: int,
-    step: int,
+    step: wp.int64,
     normal: Any,
     stamps: wp.array2d(dtype=wp.int32),
     normals: wp.array2d(dtype=Any),
 ):
     """Note that particle i is in contact with collider c in this step."""
     if colliders.slot[c] >= 0:
-        stamps[colliders.slot[c], i] = step
+        stamps[colliders.slot[c], i] = wp.int32(step)
         if colliders.entry_normal[c] == 1:
             row = 3 * colliders.slot[c]
             normals[row, i] = normal[0]
@@ -278,7 +279,7 @@ def add_contact_forces(
     x_start: wp.array2d(dtype=Any),
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
-    step: wp.array(dtype=wp.int32),
+    step: wp.array(dtype=wp.int64),
     # In:
     dt: Any,
     loss_weight: Any,
@@ -318,7 +319,7 @@ def add_contact_forces(
             if near & collider_bit(c) != wp.uint32(0):
                 held = held_contact(colliders, c, stamps, i, now)
                 before = held_normal(colliders, c, normals, i)
-                normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, now == 0)
+                normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, now == wp.int64(0))
                 if depth >= type(dt)(0.0):
                     touches = True
                     if first:

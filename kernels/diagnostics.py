@@ -66,7 +66,7 @@ def measure_chunks(
     x_start: wp.array2d(dtype=Any),
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
-    step: wp.array(dtype=wp.int32),
+    step: wp.array(dtype=wp.int64),
     stamps: wp.array2d(dtype=wp.int32),
     normals: wp.array2d(dtype=Any),
     # Out:
@@ -97,7 +97,7 @@ def measure_chunks(
             held = contacts.held_contact(colliders, c, stamps, i, step[0])
             before = contacts.held_normal(colliders, c, normals, i)
             _normal, depth, counted = contacts.find_contact(
-                colliders, c, chunk_body[chunk], vectors.load(x_start, i), point, held, before, step[0] == 0
+                colliders, c, chunk_body[chunk], vectors.load(x_start, i), point, held, before, step[0] == wp.int64(0)
             )
             if depth >= type(depth)(0.0):
                 stored += wp.float64(contacts.contact_energy(depth, counted, colliders.stiffness[c]))

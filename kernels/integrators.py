@@ -88,7 +88,7 @@ def runge_kutta_stage(
 @wp.kernel
 def count_step(
     # State in and out:
-    step: wp.array(dtype=wp.int32),
+    step: wp.array(dtype=wp.int64),
 ):
     """Count a finished step in step[0]; a launch of one thread, since captured launches freeze their scalars."""
-    step[wp.tid()] += 1
+    step[wp.tid()] += wp.int64(1)

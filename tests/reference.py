@@ -140,11 +140,34 @@ def find_contacts(collider: Any, point: np.ndarray, start: np.ndarray, up: int =
 
 
 def contact_force(collider: Any, point: np.ndarray, velocity: np.ndarray, start: np.ndarray, up: int = 1) -> np.ndarray:
-    """Sum max(0, k depth - d v.n) n over the contacts of a particle with a collider."""
+    """Sum max(0, k depth - d v.n) n, without the maximum where the collider pulls, over the contacts of a particle."""
     force = np.zeros(3)
     for normal, depth in find_contacts(collider, point, start, up):
-        force += max(0.0, collider.stiffness * depth - collider.damping * (velocity @ normal)) * normal
+        push = collider.stiffness * depth - collider.damping * (velocity @ normal)
+        force += (push if collider.pulls else max(0.0, push)) * normal
     return force
+
+
+def grid_force(field: Any, points: np.ndarray) -> np.ndarray:
+    """Sum the forces of all nodes of a grid, each weighted with its tent functions along x, y and z, [count, 3]."""
+    nodes, lower, upper = field.nodes(), np.array(field.lower), np.array(field.upper)
+    place = (np.clip(points, lower, upper) - lower) / (upper - lower) * (len(nodes) - 1)
+    tents = np.maximum(0.0, 1.0 - np.abs(np.arange(len(nodes)) - place.T[:, :, None]))
+    force = np.einsum("ni,nj,nk,ijkc->nc", *tents, nodes, optimize=True)
+    inside = ((lower <= points) & (points <= upper)).all(axis=1)
+    return force if field.outside == "clamp" else force * inside[:, None]
+
+
+def field_force(field: Any, x: np.ndarray, v: np.ndarray, charge: np.ndarray, time: float) -> np.ndarray:
+    """Return the force of a field on particles at a time, [count, 3]: its law times its curve."""
+    factor = 1.0 if field.curve is None else np.interp(time, *zip(*field.curve, strict=True))
+    if field.type == "grid":
+        return factor * grid_force(field, x)
+    if field.type == "electric":
+        return factor * np.outer(charge, field.strength)
+    if field.type == "magnetic":
+        return factor * charge[:, None] * np.cross(v, field.strength)
+    return factor * np.tile(field.force, (len(x), 1))
 
 
 def contact_energy(collider: Any, point: np.ndarray, start: np.ndarray, up: int = 1) -> float:
@@ -165,7 +188,7 @@ class World:
     """A scene of cubes and voxels in motion by semi-implicit Euler."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.dt = scene, scene.dt
+        self.scene, self.dt, self.steps = scene, scene.dt, 0
         self.keys: list[list[Key]] = []
         xs, vs, ms, bodies, springs, self.starts = [], [], [], [], [], []
         first = 0
@@ -177,6 +200,8 @@ class World:
             material = scene.materials[body.material]
             rest_shape = unit * np.array([key[0] for key in lattice.keys]) - edge * np.array(cells.shape) / 2
             x = rest_shape @ rotation(body.rotation).T + body.position
+            if getattr(body, "positions", None) is not None:
+                x = np.array(body.positions)
             if material.density is not None:
                 m = np.array([material.density * unit**3 * len(key[1]) / 8 for key in lattice.keys])
             else:
@@ -191,8 +216,9 @@ class World:
                 springs.append((i, j, rest, constants.stiffness * per_length, constants.damping * per_length))
             self.keys.append(lattice.keys)
             self.starts.append(start)
+            v = body.velocity + np.cross(body.angular_velocity, x - start)
             xs.append(x)
-            vs.append(body.velocity + np.cross(body.angular_velocity, x - start))
+            vs.append(v if getattr(body, "velocities", None) is None else np.array(body.velocities))
             ms.append(m)
             bodies.append(np.full(len(x), number))
             first += len(x)
@@ -207,6 +233,9 @@ class World:
         f += spring_forces(self.x, self.v, self.ends, self.rest, self.k, self.d)
         for collider, (i, body) in itertools.product(self.scene.colliders, enumerate(self.body)):
             f[i] += contact_force(collider, self.x[i], self.v[i], self.starts[body], self.scene.up)
+        charge = np.array([self.scene.bodies[body].charge for body in self.body])
+        for field in self.scene.fields:
+            f += field_force(field, self.x, self.v, charge, self.steps * self.dt)
         return f
 
     def step(self, count: int = 1) -> None:
@@ -214,6 +243,7 @@ class World:
         for _ in range(count):
             self.v = self.v + self.dt * self.forces() / self.m[:, None]
             self.x = self.x + self.dt * self.v
+            self.steps += 1
 
     def top_frequency(self) -> float:
         """Return the largest angular frequency of the springs at rest, rad/s: the root of the top of M^-1 K."""

@@ -31,8 +31,9 @@ def launch_everything() -> None:
         {"type": "sphere", "radius": 1.0},
         {"type": "box", "size": [1.0, 1.0, 1.0]},
     ]
+    parts = {"colliders": colliders, "fields": [{"type": "constant", "force": [0.0, 0.0, 0.0]}]}
     for precision in ("float32", "float64"):
-        simulator = Simulator(make_scene(colliders=colliders, solver={"precision": precision}), device="cpu")
+        simulator = Simulator(make_scene(**parts, solver={"precision": precision}), device="cpu")
         simulator.step()
         simulator.first_lost()
         simulator.diagnostics()

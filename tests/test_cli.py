@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
+from world_files import WORLDS
 
 import warpjelly as wj
 from warpjelly import cli, plan
@@ -366,6 +367,32 @@ def test_rgb_colours_are_stored_on_request(warpjelly, tmp_path):
         stage = Usd.Stage.Open(str(tmp_path / option / "stage.usdc"))
         mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/bodies/cube/surface"))
         assert UsdGeom.Primvar(mesh.GetDisplayColorAttr()).IsIndexed() is indexed
+
+
+def test_a_world_runs_and_comes_back(warpjelly, tmp_path):
+    """Run a world, export it again, keep what is there unless forced, and refuse a bad one with its line."""
+    world = tmp_path / "left.w"
+    world.write_text(WORLDS["left"].text())
+    settings = ["--set", "solver.integrator=semi_implicit_euler", "--frames", 3, "--json"]
+    code, out, err = warpjelly("run", world, *settings, "-o", tmp_path / "run")
+    assert (code, err) == (0, "")
+    record = json.loads(out)
+    assert (record["fps"], record["substeps"], record["dt"], record["precision"]) == (2000.0, 1, 0.0005, "float64")
+    assert warpjelly("validate", tmp_path / "run")[0] == 0
+    code, out, err = warpjelly("export-world", world, "-o", tmp_path / "again.w")
+    assert (code, err) == (0, "")
+    assert wj.load_scene(tmp_path / "again.w").bodies == wj.load_scene(world).bodies
+    code, _, err = warpjelly("export-world", world, "-o", tmp_path / "again.w")
+    assert code == 2
+    assert "--force" in one_line(err)
+    assert warpjelly("export-world", world, "-o", tmp_path / "again.w", "--force")[0] == 0
+    code, _, err = warpjelly("export-world", CUBE, "-o", tmp_path / "cube.w")
+    assert code == 2
+    assert "solver.integrator" in one_line(err)
+    world.write_text("RK4\n0.0005")
+    code, _, err = warpjelly("run", world)
+    assert code == 2
+    assert f"{world}: line 2: the file ends here" in one_line(err)
 
 
 def test_doctor_names_versions_devices_and_extras(warpjelly):

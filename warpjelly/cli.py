@@ -27,7 +27,7 @@ app = typer.Typer(
     epilog="Start with:  warpjelly run scenes/tree_drop.toml",
 )
 
-SceneArgument = Annotated[Path, typer.Argument(help="Scene file (.toml).", show_default=False)]
+SceneArgument = Annotated[Path, typer.Argument(help="Scene file (.toml) or jello cube world (.w).", show_default=False)]
 SetOption = Annotated[
     list[str],
     typer.Option(
@@ -187,6 +187,22 @@ def preview(
 
     render_preview(source, output, frames=frames or None, size=(int(width), int(height)))
     print(f"picture: {output}")
+
+
+@app.command()
+def export_world(
+    scene: SceneArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", help="World to write, .w.", show_default=False)],
+    settings: SetOption = [],  # noqa: B006
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+) -> None:
+    """Write a CMU jello cube world from a scene that fits one."""
+    loaded = _load(scene, _overrides(settings), None)
+
+    from .worldfile import write_world
+
+    write_world(loaded, output, force=force)
+    print(f"world: {output}")
 
 
 @app.command()

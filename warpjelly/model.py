@@ -9,11 +9,23 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, springs
+from warpjelly.kernels import bounds, contacts, fields, springs
 
 from .lattice import REST_LENGTHS, Lattice, build_lattice
 from .plan import BodyPlan, Plan
-from .scene import DEFAULT_PARTICLE_MASS, AnyCollider, BoxCollider, Material, PlaneCollider, Scene, SphereCollider
+from .scene import (
+    DEFAULT_PARTICLE_MASS,
+    AnyCollider,
+    BoxCollider,
+    ConstantField,
+    CubeBody,
+    GridField,
+    MagneticField,
+    Material,
+    PlaneCollider,
+    Scene,
+    SphereCollider,
+)
 
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
@@ -48,6 +60,8 @@ class Model:
     """real [particle_count], kg."""
     particle_inv_mass: wp.array
     """real [particle_count], 1/kg."""
+    particle_charge: wp.array
+    """real [particle_count], C."""
     spans: wp.array
     """(i, j, count, class) of each run of springs, vec4i [span_count]."""
     spring_classes: wp.array
@@ -60,6 +74,8 @@ class Model:
     """real vec3 [1], m/s^2."""
     colliders: Any
     """The table of kernels/contacts.py; a box of the scene is six half-spaces here."""
+    fields: Any
+    """The table of kernels/fields.py."""
     surface_particles: wp.array
     """int32 [point_count], body after body."""
     surface_quads: wp.array
@@ -68,7 +84,7 @@ class Model:
 
 @dataclass(frozen=True)
 class State:
-    """What changes, real [3, particle_count] each; updated in place."""
+    """What changes, real [3, particle_count] each unless said otherwise; updated in place."""
 
     x: wp.array
     """Positions, m."""
@@ -79,13 +95,16 @@ class State:
     x_start: wp.array
     """Positions at the start of the step, m; before it, at the start of the last one."""
     step: wp.array
-    """Steps since the start, int32 [1]."""
+    """Steps since the start, int64 [1]."""
     stamps: wp.array
-    """Step in which a particle was last in contact with a plane or a sphere, int32 [slot_count, particle_count]."""
+    """Step in which a particle was last in contact with a plane or a sphere, its low 32 bits, int32 [slot_count,
+    particle_count]."""
     normals: wp.array
     """Normals of those contacts for spheres that remember them, real [3 slot_count, particle_count]."""
     spring_losses: wp.array
     """Energy taken by the dampers of each span, float64 [span_count], J."""
+    field_work: wp.array
+    """Energy given by fields to each particle, float64 [particle_count], J; empty without fields."""
     contact_losses: wp.array
     """Energy taken by contact damping and by friction in each chunk, float64 [2, chunk_count], J."""
 
@@ -96,7 +115,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     real = PRECISIONS[scene.solver.precision]
     vector = wp.types.vector(3, real)
     bodies: list[Body] = []
-    positions, velocities, masses, spans, classes, chunks, chunk_bodies = [], [], [], [], [], [], []
+    positions, velocities, masses, charges, spans, classes, chunks, chunk_bodies = [], [], [], [], [], [], [], []
     surface_particles, surface_quads = [], []
     particle_count = point_count = spring_count = 0
     for number, body_plan in enumerate(plan.bodies):
@@ -109,10 +128,11 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         )
         count = len(lattice.particles)
         mass = _masses(lattice, material)
-        x, v = _place(lattice, mass, body_plan)
+        x, v = place(lattice, mass, body_plan)
         positions.append(x)
         velocities.append(v)
         masses.append(mass)
+        charges.append(np.full(count, body.charge))
         body_spans = springs_to_spans(lattice.springs, lattice.spring_kinds)
         spans.append(body_spans + np.array([particle_count, particle_count, 0, 4 * number], np.int32))
         classes.append(spring_classes(material, lattice.unit))
@@ -147,12 +167,14 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         spring_count=spring_count,
         particle_mass=array(mass, real),
         particle_inv_mass=array(1.0 / mass, real),
+        particle_charge=array(np.concatenate(charges), real),
         spans=array(np.concatenate(spans), wp.vec4i),
         spring_classes=array(np.concatenate(classes), vector),
         chunk_start=array(np.append(np.concatenate(chunks), np.int32(particle_count)), wp.int32),
         chunk_body=array(np.concatenate(chunk_bodies), wp.int32),
         gravity=array(scene.gravity_vector[None], vector),
         colliders=_colliders(scene, [_center_of_mass(x[b.particles], mass[b.particles]) for b in bodies], real, device),
+        fields=_fields(scene, real, device),
         surface_particles=array(np.concatenate(surface_particles), wp.int32),
         surface_quads=array(np.concatenate(surface_quads), wp.vec4i),
     )
@@ -164,10 +186,11 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         v=array(np.ascontiguousarray(v.T), real),
         f=wp.zeros((3, particle_count), dtype=real, device=device),
         x_start=array(np.ascontiguousarray(x.T), real),
-        step=wp.zeros(1, dtype=wp.int32, device=device),
+        step=wp.zeros(1, dtype=wp.int64, device=device),
         stamps=wp.full((slots, particle_count), -2, dtype=wp.int32, device=device),
         normals=wp.zeros((3 * remembered, particle_count), dtype=real, device=device),
         spring_losses=wp.zeros(len(model.spans), dtype=wp.float64, device=device),
+        field_work=wp.zeros(particle_count if scene.fields else 0, dtype=wp.float64, device=device),
         contact_losses=wp.zeros((2, len(model.chunk_body)), dtype=wp.float64, device=device),
     )
     return model, state
@@ -219,7 +242,7 @@ def _center_of_mass(positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
     return mass @ positions / mass.sum()
 
 
-def _place(lattice: Lattice, mass: np.ndarray, plan: BodyPlan) -> tuple[np.ndarray, np.ndarray]:
+def place(lattice: Lattice, mass: np.ndarray, plan: BodyPlan) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities of a body at time zero, float64 [particle_count, 3] each."""
     body = plan.body
     turn = np.eye(3)
@@ -230,8 +253,48 @@ def _place(lattice: Lattice, mass: np.ndarray, plan: BodyPlan) -> tuple[np.ndarr
         about[w, u], about[u, w] = np.sin(angle), -np.sin(angle)
         turn = about @ turn
     x = lattice.particles @ turn.T + body.position
+    if isinstance(body, CubeBody) and body.positions is not None:
+        x = np.array(body.positions)
+    if isinstance(body, CubeBody) and body.velocities is not None:
+        return x, np.array(body.velocities)
     arm = x - _center_of_mass(x, mass)
     return x, np.asarray(body.velocity) + np.cross(body.angular_velocity, arm)
+
+
+def _fields(scene: Scene, real: type, device: str) -> Any:
+    """Return the table of fields for the kernels."""
+    rows: list[dict[str, Any]] = []
+    nodes, curves = [np.zeros((0, 3))], [np.zeros((0, 2))]
+    for field in scene.fields:
+        row: dict[str, Any] = {"node_start": sum(map(len, nodes))}
+        if isinstance(field, GridField):
+            grid = field.nodes()
+            nodes.append(grid.reshape(-1, 3))
+            row |= {"kind": fields.GRID, "lower": field.lower, "upper": field.upper, "resolution": len(grid)}
+            row["clamped"] = field.outside == "clamp"
+        elif isinstance(field, ConstantField):
+            row |= {"kind": fields.CONSTANT, "strength": field.force}
+        else:
+            kind = fields.MAGNETIC if isinstance(field, MagneticField) else fields.ELECTRIC
+            row |= {"kind": kind, "strength": field.strength}
+        rows.append(row)
+        curves.append(np.array(field.curve or np.zeros((0, 2))))
+
+    def array(data: Any, dtype: Any) -> wp.array:
+        return wp.array(data, dtype=dtype, device=device)
+
+    vector = wp.types.vector(3, real)
+    table = fields.FIELDS[real]()
+    for name in ("kind", "resolution", "node_start", "clamped"):
+        setattr(table, name, array(np.array([row.get(name, 0) for row in rows], np.int32), wp.int32))
+    for name in ("strength", "lower", "upper"):
+        data = np.array([row.get(name, np.zeros(3)) for row in rows], float).reshape(-1, 3)
+        setattr(table, name, array(data, vector))
+    table.nodes = array(np.concatenate(nodes), vector)
+    table.curve_start = array(np.cumsum([len(curve) for curve in curves], dtype=np.int32), wp.int32)
+    keyframes = np.concatenate(curves)
+    table.curve_time, table.curve_factor = (array(np.ascontiguousarray(column), wp.float64) for column in keyframes.T)
+    return table
 
 
 def _colliders(scene: Scene, centers_of_mass: Sequence[np.ndarray], real: type, device: str) -> Any:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import difflib
 import json
 import math
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -20,6 +22,7 @@ from pydantic import (
     Field,
     StringConstraints,
     ValidationInfo,
+    WithJsonSchema,
     field_validator,
     model_validator,
 )
@@ -89,6 +92,14 @@ class Solver(Table):
     culling: Switch = Field(
         True, description="skip contact tests of particles whose bounding box is clear; same result"
     )
+    steps_per_frame: int | None = Field(
+        None,
+        strict=True,
+        ge=1,
+        le=MAX_SUBSTEPS,
+        description="take exactly this many steps of exactly dt between samples; fps is then 1 / (dt * steps) and best "
+        "left out. Unless given, dt adapts to fps",
+    )
 
 
 class SpringConstants(Table):
@@ -128,6 +139,7 @@ class Body(Table):
     rotation: Vector = Field((0.0, 0.0, 0.0), description="degrees about x, then y, then z, through the body's origin")
     velocity: Rates = Field((0.0, 0.0, 0.0), description="of the centre of mass, m/s")
     angular_velocity: Rates = Field((0.0, 0.0, 0.0), description="about the centre of mass, rad/s")
+    charge: Number = Field(0.0, description="of each particle, C; what electric and magnetic fields act on")
 
 
 class CubeBody(Body):
@@ -136,6 +148,30 @@ class CubeBody(Body):
     type: Literal["cube"]
     size: Length = Field(1.0, description="edge, m")
     particles_per_edge: int = Field(8, strict=True, ge=2, le=4096, description="particles along an edge")
+    positions: list[Point] | None = Field(
+        None,
+        description="where each particle starts, m, in the axes of the scene: x outermost, z innermost; instead of "
+        "position and rotation. The rest shape remains that of size",
+    )
+    velocities: list[Vector] | None = Field(
+        None, description="how each particle starts, m/s, in the same order; instead of velocity and angular_velocity"
+    )
+
+    @model_validator(mode="after")
+    def _particles_are_given_once(self) -> Self:
+        count = self.particles_per_edge**3
+        for key, instead in (("positions", ("position", "rotation")), ("velocities", ("velocity", "angular_velocity"))):
+            if (given := getattr(self, key)) is None:
+                continue
+            if len(given) != count:
+                what = {"key": key, "given": len(given), "count": count}
+                raise PydanticCustomError("particles", "{key} has {given} entries for {count} particles", what)
+            for other in instead:
+                if any(getattr(self, other)):
+                    raise PydanticCustomError(
+                        "particles", "give {key} or {other}, not both", {"key": key, "other": other}
+                    )
+        return self
 
 
 class VoxelsBody(Body):
@@ -171,6 +207,14 @@ class VoxelsBody(Body):
         return np.ascontiguousarray(filled.transpose(2, 0, 1))
 
 
+def _existing(file: Path, info: ValidationInfo) -> Path:
+    """Return the full path of a file that is given relative to the scene file."""
+    file = Path((info.context or {}).get("folder", "."), file).absolute()
+    if not file.is_file():
+        raise PydanticCustomError("file", "no such file ({path})", {"path": str(file)})
+    return file
+
+
 class ModelBody(Body):
     """A mesh turned into jelly cubes; the origin is that of the model file."""
 
@@ -185,10 +229,7 @@ class ModelBody(Body):
     @field_validator("file", mode="after")
     @classmethod
     def _file_is_relative_to_the_scene(cls, file: Path, info: ValidationInfo) -> Path:
-        file = Path((info.context or {}).get("folder", "."), file).absolute()
-        if not file.is_file():
-            raise PydanticCustomError("file", "no such file ({path})", {"path": str(file)})
-        return file
+        return _existing(file, info)
 
 
 class Contact(Table):
@@ -296,6 +337,121 @@ class BoxCollider(Collider):
     size: tuple[Length, Length, Length] = Field(description="edges along x, y and z, m")
 
 
+class ForceField(Table):
+    """What all fields have: a curve over time."""
+
+    curve: list[tuple[Number, Number]] | None = Field(
+        None,
+        min_length=1,
+        description="keyframes [time in s, factor], times ascending: the field is multiplied by the factor, linear in "
+        "between and constant outside; always 1 unless given",
+    )
+
+    @field_validator("curve")
+    @classmethod
+    def _times_ascend(cls, curve: list[tuple[float, float]] | None) -> list[tuple[float, float]] | None:
+        for i, (before, after) in enumerate(pairwise(curve or [])):
+            if not before[0] < after[0]:
+                what = {"i": i + 1, "after": after[0], "before": before[0]}
+                raise PydanticCustomError("curve", "times must ascend; entry {i}, {after} s, follows {before} s", what)
+        return curve
+
+
+class ConstantField(ForceField):
+    """The same force everywhere."""
+
+    type: Literal["constant"]
+    force: Vector = Field(description="on each particle, N")
+
+
+class GridField(ForceField):
+    """Forces at R x R x R nodes over a box, trilinear in between."""
+
+    type: Literal["grid"]
+    lower: Point = Field(description="corner of the box, where the first node is, m")
+    upper: Point = Field(description="opposite corner, m")
+    forces: Annotated[list[Vector], WithJsonSchema({"type": "array"})] | None = Field(
+        None,
+        description="force on each particle at each node, N: x outermost, z innermost, nested or flat; R follows",
+    )
+    file: Path | None = Field(
+        None,
+        description="the forces in a NumPy file, relative to the scene file: .npy, or .npz with one array; [R, R, R, 3]"
+        " or [R^3, 3]",
+    )
+    outside: Literal["clamp", "zero"] = Field(
+        "clamp", description="force outside the box; clamp: that of the nearest point of the box"
+    )
+
+    @field_validator("forces", mode="before")
+    @classmethod
+    def _flatten(cls, forces: Any) -> Any:
+        def nests(entry: Any) -> bool:
+            return isinstance(entry, list | tuple) and len(entry) > 0 and isinstance(entry[0], list | tuple)
+
+        # Vectors lie under one level of lists, or under three.
+        for _ in range(2):
+            if isinstance(forces, list | tuple) and all(nests(entry) for entry in forces):
+                forces = [inner for entry in forces for inner in entry]
+        return forces
+
+    @field_validator("file", mode="after")
+    @classmethod
+    def _file_is_relative_to_the_scene(cls, file: Path | None, info: ValidationInfo) -> Path | None:
+        return None if file is None else _existing(file, info)
+
+    @model_validator(mode="after")
+    def _nodes_fill_the_box(self) -> Self:
+        if (self.forces is None) == (self.file is None):
+            raise PydanticCustomError("grid", "give either forces or file")
+        if any(a >= b for a, b in zip(self.lower, self.upper, strict=True)):
+            raise PydanticCustomError("grid", "lower must be below upper along every axis")
+        self.nodes()
+        return self
+
+    def nodes(self) -> np.ndarray:
+        """Return the forces at the nodes, float64 [R, R, R, 3], N."""
+        source = "forces" if self.file is None else str(self.file)
+        data = np.array(self.forces, float) if self.file is None else _read_array(self.file)
+        resolution = round((data.size / 3) ** (1 / 3))
+        if resolution < 2 or data.shape not in [(resolution**3, 3), (resolution,) * 3 + (3,)]:
+            what = {"source": source, "shape": str(list(data.shape))}
+            raise PydanticCustomError(
+                "grid", "{source}: has the shape {shape}; it must be [R, R, R, 3] or [R^3, 3] with R at least 2", what
+            )
+        if not np.abs(data).max() <= MAX_MAGNITUDE:
+            raise PydanticCustomError("grid", "{source}: has forces that are not finite or absurd", {"source": source})
+        return data.reshape(resolution, resolution, resolution, 3)
+
+
+def _read_array(file: Path) -> np.ndarray:
+    """Read a .npy file, or a .npz file with one array, as float64."""
+    try:
+        data = np.load(file, allow_pickle=False)
+        if isinstance(data, np.ndarray):
+            return data.astype(float)
+        with data:
+            (name,) = data.files
+            return data[name].astype(float)
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        what = {"file": str(file), "why": str(error)}
+        raise PydanticCustomError("grid", "{file}: not a NumPy file with one array of numbers: {why}", what) from error
+
+
+class ElectricField(ForceField):
+    """A uniform electric field: force q E."""
+
+    type: Literal["electric"]
+    strength: Vector = Field(description="E, V/m")
+
+
+class MagneticField(ForceField):
+    """A uniform magnetic field: force q v x B."""
+
+    type: Literal["magnetic"]
+    strength: Vector = Field(description="B, T")
+
+
 class Output(Table):
     """What is written."""
 
@@ -354,6 +510,7 @@ class Expect(Table):
 
 AnyBody = Annotated[CubeBody | VoxelsBody | ModelBody, Field(discriminator="type")]
 AnyCollider = Annotated[HalfSpaceCollider | PlaneCollider | SphereCollider | BoxCollider, Field(discriminator="type")]
+AnyField = Annotated[ConstantField | GridField | ElectricField | MagneticField, Field(discriminator="type")]
 
 
 class Scene(Table):
@@ -364,7 +521,7 @@ class Scene(Table):
     frames: int | None = Field(
         None, strict=True, ge=1, le=MAX_FRAMES, description="number of samples, instead of duration"
     )
-    fps: float = Field(60.0, strict=True, allow_inf_nan=False, ge=0.1, le=1e5, description="samples per second")
+    fps: float = Field(60.0, strict=True, allow_inf_nan=False, ge=0.1, le=1e9, description="samples per second")
     up_axis: Literal["Y", "Z"] = Field("Y", description="which axis points up")
     gravity: Rates | None = Field(None, description="m/s^2; 9.81 downwards unless given")
     solver: Solver = Field(Solver(), description="time integration")
@@ -372,6 +529,7 @@ class Scene(Table):
     bodies: list[AnyBody] = Field(min_length=1, description="what is made of jelly")
     contact: Contact = Field(Contact(), description="how colliders push back unless they say otherwise")
     colliders: list[AnyCollider] = Field([], description="what the bodies collide with")
+    fields: list[AnyField] = Field([], description="forces on every particle, besides gravity")
     output: Output = Field(Output(), description="what is written")
     expect: Expect = Field(Expect(), description="what the scene is for, as numbers")
 
@@ -388,6 +546,16 @@ class Scene(Table):
                     for i, entry in enumerate(entries)
                 ]
         return data
+
+    @model_validator(mode="before")
+    @classmethod
+    def _let_fps_follow_exact_steps(cls, data: Any) -> Any:
+        if not isinstance(data, Mapping) or "fps" in data or not isinstance(data.get("solver"), Mapping):
+            return data
+        steps, dt = data["solver"].get("steps_per_frame"), data["solver"].get("dt", Solver.model_fields["dt"].default)
+        # Whatever is not a number is refused where it belongs.
+        numbers = isinstance(steps, int) and isinstance(dt, float | int) and steps > 0 and dt > 0
+        return {**data, "fps": 1.0 / (steps * dt)} if numbers else data
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
@@ -412,6 +580,10 @@ class Scene(Table):
             refuse("duration", self.duration, "give duration or frames, not both")
         if self.duration is not None and not 1 <= round(self.duration * self.fps) <= MAX_FRAMES:
             refuse("duration", self.duration, f"at {self.fps:g} fps this is not between 1 and {MAX_FRAMES} frames")
+        steps = self.solver.steps_per_frame
+        if steps is not None and not math.isclose(self.fps * steps * self.solver.dt, 1.0, rel_tol=1e-9):
+            fps = 1.0 / (steps * self.solver.dt)
+            refuse("fps", self.fps, f"leave it out; solver.steps_per_frame and solver.dt make it {fps:.9g}")
         if self.substeps > MAX_SUBSTEPS:
             refuse("solver.dt", self.solver.dt, f"more than {MAX_SUBSTEPS} substeps a frame at {self.fps:g} fps")
         return self
@@ -424,12 +596,16 @@ class Scene(Table):
     @property
     def substeps(self) -> int:
         """Substeps per frame: as many as the largest step that divides a frame and does not exceed ``dt`` takes."""
+        if self.solver.steps_per_frame is not None:
+            return self.solver.steps_per_frame
         # The tolerance keeps 1/60 s at dt = 1/600 s at ten substeps, whatever the last bit of the quotient.
         return max(1, math.ceil(1.0 / (self.fps * self.solver.dt) * (1 - 1e-9)))
 
     @property
     def dt(self) -> float:
         """The time step used, s."""
+        if self.solver.steps_per_frame is not None:
+            return self.solver.dt
         return 1.0 / (self.fps * self.substeps)
 
     @property

@@ -1,4 +1,4 @@
-"""Read a scene file: TOML, overrides, and errors that people can act on."""
+"""Read a scene file: TOML or a CMU world, overrides, and errors that people can act on."""
 
 from __future__ import annotations
 
@@ -12,32 +12,30 @@ from pydantic import ValidationError
 
 from .errors import InputError
 from .scene import Scene, Table
+from .worldfile import SUFFIX, read_world, settle_time
 
 
 def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, frames: int | None = None) -> Scene:
     """Read and validate a scene file.
 
     Args:
-        path: TOML file.
+        path: TOML file, or a jello cube world, .w.
         overrides: values by dotted key, for example ``{"solver.dt": 5e-4, "bodies.0.size": 2.0}``; an entry of a list
             goes by its number or its name.
         frames: number of samples, instead of the scene's frames or duration. What the scene expects of itself goes with
             its own length, and is left out.
 
     Raises:
-        InputError: the file cannot be read, is not TOML, or is not a scene; the message names file, key and value.
+        InputError: the file cannot be read, or is not what its name says; the message names the file and the key and
+            value, or the line.
     """
-    path = Path(path)
-    try:
-        data = tomllib.loads(path.read_text(encoding="utf-8"))
-    except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
-    # TOML's own errors are among these, and numbers of thousands of digits.
-    except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
-    for key, value in (overrides or {}).items():
+    path, overrides = Path(path), overrides or {}
+    if path.suffix.lower() == SUFFIX:
+        data = read_world(path)
+        overrides = settle_time(path, data, overrides)
+    else:
+        data = _read_toml(path)
+    for key, value in overrides.items():
         _override(data, key, value)
     if frames is not None:
         data.pop("duration", None)
@@ -48,6 +46,18 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         return Scene.model_validate(data, context={"folder": path.parent})
     except ValidationError as error:
         raise InputError(f"{path}: {_explain(error)}") from error
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
+    # TOML's own errors are among these, and numbers of thousands of digits.
+    except ValueError as error:
+        raise InputError(f"{path}: not valid TOML: {error}") from error
+    except OSError as error:
+        raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
 
 
 def _override(data: dict[str, Any], key: str, value: Any) -> None:
@@ -113,9 +123,9 @@ def _explain(error: ValidationError) -> str:
 
 
 def _key(location: tuple[int | str, ...]) -> str:
-    """Return the dotted key of an error, without the tags that pydantic adds for bodies, colliders and unions."""
+    """Return the dotted key of an error, without the tags that pydantic adds for entries of lists and unions."""
     parts = [str(part) for part in location]
-    if len(parts) > 2 and parts[0] in ("bodies", "colliders"):
+    if len(parts) > 2 and parts[0] in ("bodies", "colliders", "fields"):
         del parts[2]
     return ".".join(part for part in parts if "[" not in part and not part.startswith("literal"))
 

@@ -73,6 +73,8 @@ class Simulator:
             self._integrate_stage(0.0, 0.0, 0.0, first=True, last=True)
         else:
             self._integrate(0.0)
+        self._launch(integrators.count_step, 1, [], [self.state.step])
+        self.state.step.zero_()
 
     @property
     def time(self) -> float:
@@ -167,6 +169,7 @@ class Simulator:
             "potential": float(total[diagnostics.POTENTIAL]),
             "contact": float(total[diagnostics.CONTACT]),
             "spring_losses": float(self.state.spring_losses.numpy().sum()),
+            "field_work": float(self.state.field_work.numpy().sum()),
             "contact_losses": float(contact_losses[0]),
             "friction_losses": float(contact_losses[1]),
             "momentum": total[diagnostics.MOMENTUM :][:3].copy(),
@@ -265,9 +268,9 @@ class Simulator:
             self._integrate(self.scene.dt)
         else:
             stages = integrators.STAGES[self.scene.solver.integrator]
-            for number, (_share, weight, reach) in enumerate(stages):
+            for number, (share, weight, reach) in enumerate(stages):
                 first, last = number == 0, number == len(stages) - 1
-                self._add_forces(loss_weight=weight * self.scene.dt, first=first)
+                self._add_forces(loss_weight=weight * self.scene.dt, offset=share * self.scene.dt, first=first)
                 self._integrate_stage(self.scene.dt, weight, reach, first=first, last=last)
         self._launch(integrators.count_step, 1, [], [self.state.step])
 
@@ -290,17 +293,29 @@ class Simulator:
             [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
         )
 
-    def _add_forces(self, *, loss_weight: float, first: bool = True) -> None:
+    def _add_forces(self, *, loss_weight: float, offset: float = 0.0, first: bool = True) -> None:
         """Overwrite the forces with those at the current positions and velocities.
 
         Args:
-            loss_weight: what the power of dampers and friction counts for in the losses, s.
+            loss_weight: what the power of dampers and friction counts for in the losses, and that of fields in their
+                work, s.
+            offset: time since the start of the step, s.
             first: whether this is the first evaluation of a step, which remembers contacts.
         """
         model, state = self.model, self.state
         on_cpu = self.device == "cpu"
         weight = model.real(loss_weight)
         self._launch(fields.set_gravity_forces, model.particle_count, [model.particle_mass, model.gravity], [state.f])
+        if self.scene.fields:
+            self._launch(
+                fields.add_field_forces,
+                model.particle_count,
+                [
+                    *(model.particle_charge, model.fields, state.step, state.x, state.v),
+                    *(wp.float64(self.scene.dt), wp.float64(offset), wp.float64(loss_weight)),
+                ],
+                [state.f, state.field_work],
+            )
         spring_inputs = [model.spans, model.spring_classes, state.x, state.v, weight]
         spring_outputs = [state.f, state.spring_losses]
         if on_cpu:
