@@ -27,6 +27,11 @@ log = logging.getLogger("warpjelly")
 RECORD_NAME, METRICS_NAME = "run.json", "metrics.csv"
 # A body that starts deeper than this in a collider, in unit cells, is thrown out of it, which is seldom meant.
 DEEP_START = 0.05
+# Finding the largest stable step takes at most as long as this many evaluations of the forces. A run warns of a longer
+# step where these are a small share of its own, or quick anyway, as so many springs are.
+LIMIT_EVALUATIONS = 600
+LIMIT_SHARE = 0.02
+LIMIT_SPRINGS = 100_000_000
 # How long a forecast measures, s.
 FORECAST_SECONDS = 0.3
 
@@ -92,6 +97,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         for body, surface in zip(sim.model.bodies, rest, strict=True)
     ]
     _warn_of_deep_starts(sim)
+    _warn_of_long_steps(sim)
     writer = StageWriter(folder / STAGE_NAME, scene=scene, meshes=meshes, provenance=provenance(scene, sim))
     observer = Observer(sim)
     sim.prepare()
@@ -116,7 +122,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
     except KeyboardInterrupt as interrupt:
         interrupted = interrupt
     writer.close()
-    evaluations = max(frames - 1, 0) * scene.substeps
+    evaluations = max(frames - 1, 0) * sim.substeps
     outcomes = observer.outcomes()
     record = {
         "scene": scene.name,
@@ -127,8 +133,8 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         "particles": sim.model.particle_count,
         "springs": sim.model.spring_count,
         "voxels": sim.model.voxel_count,
-        "substeps": scene.substeps,
-        "dt": scene.dt,
+        "substeps": sim.substeps,
+        "dt": sim.dt,
         "precision": scene.solver.precision,
         "wall_seconds": time.perf_counter() - began,
         "springs_per_second": sim.model.spring_count * evaluations / stepping if evaluations else 0.0,
@@ -148,20 +154,23 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
 
     Returns:
         ``particles, springs, voxels``; ``memory_bytes``, an estimate of the peak; ``dt`` [s], ``substeps`` a frame,
-        ``frames``; ``seconds``, an estimate from this machine's speed now; ``device``.
+        ``frames``; ``dt_limit`` and ``dt_limit_in_contact``, the largest stable step by integrator, s or None;
+        ``seconds``, an estimate from this machine's speed now; ``device``.
 
     Raises:
         InputError: the scene cannot be built.
     """
     plan = plan_scene(scene)
     sim = Simulator(plan, device=device)
+    if broken := sim.broken_limit():
+        log.warning("%s", broken)
     sim.step()
     sim.surfaces()
     sim.diagnostics()
     began = time.perf_counter()
     sim.step()
     # Whole frames where they are quick, as a run does them; single substeps where a frame would take too long.
-    count = scene.substeps if scene.substeps * (time.perf_counter() - began) < FORECAST_SECONDS else 1
+    count = sim.substeps if sim.substeps * (time.perf_counter() - began) < FORECAST_SECONDS else 1
     sim.prepare()
     began, substeps = time.perf_counter(), 0
     while substeps == 0 or time.perf_counter() - began < FORECAST_SECONDS:
@@ -170,15 +179,17 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     stepped = time.perf_counter()
     sim.surfaces()
     sim.diagnostics()
-    frame = (stepped - began) / substeps * scene.substeps + time.perf_counter() - stepped
+    frame = (stepped - began) / substeps * sim.substeps + time.perf_counter() - stepped
     return {
         "scene": scene.name,
         "voxels": sim.model.voxel_count,
         "particles": sim.model.particle_count,
         "springs": sim.model.spring_count,
         "memory_bytes": plan.memory_bytes,
-        "dt": scene.dt,
-        "substeps": scene.substeps,
+        "dt": sim.dt,
+        "dt_limit": sim.step_limits(contacts=False),
+        "dt_limit_in_contact": sim.step_limits(contacts=True),
+        "substeps": sim.substeps,
         "frames": scene.frame_count,
         "seconds": frame * (scene.frame_count - 1),
         "device": sim.device,
@@ -211,6 +222,14 @@ def _warn_of_deep_starts(sim: Simulator) -> None:
     for body, depth in zip(sim.model.bodies, sim.penetrations(), strict=True):
         if depth > DEEP_START * body.unit:
             log.warning("body '%s' starts %.3g m deep in a collider and will be thrown out of it", body.name, depth)
+
+
+def _warn_of_long_steps(sim: Simulator) -> None:
+    quick = LIMIT_EVALUATIONS * sim.model.spring_count <= LIMIT_SPRINGS
+    if not quick and LIMIT_EVALUATIONS > LIMIT_SHARE * sim.substeps * sim.scene.frame_count:
+        return
+    if broken := sim.broken_limit():
+        log.warning("%s", broken)
 
 
 def _write_atomically(path: Path, text: str) -> None:

@@ -37,6 +37,7 @@ Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX
 NotNegative = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=0, le=MAX_MAGNITUDE)]
 Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_LENGTH, le=MAX_LENGTH)]
 Length = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-6, le=MAX_LENGTH)]
+Step = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-9, le=1.0)]
 Vector = tuple[Number, Number, Number]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Switch = Annotated[bool, Field(strict=True)]
@@ -66,13 +67,10 @@ class Solver(Table):
     """How time advances."""
 
     integrator: Literal["semi_implicit_euler"] = Field("semi_implicit_euler", description="time integration scheme")
-    dt: float = Field(
+    dt: Step | Literal["auto"] = Field(
         1e-3,
-        strict=True,
-        ge=1e-9,
-        le=1.0,
-        allow_inf_nan=False,
-        description="largest time step, s; the step used is the largest one below it that divides a frame",
+        description="largest time step, s; the step used is the largest one below it that divides a frame; "
+        "auto: a safe share of the largest stable step",
     )
     precision: Literal["float32", "float64"] = Field("float32", description="floating-point type of the simulation")
     culling: Switch = Field(
@@ -367,7 +365,7 @@ class Scene(Table):
             refuse("duration", self.duration, "give duration or frames, not both")
         if self.duration is not None and not 1 <= round(self.duration * self.fps) <= MAX_FRAMES:
             refuse("duration", self.duration, f"at {self.fps:g} fps this is not between 1 and {MAX_FRAMES} frames")
-        if self.substeps > MAX_SUBSTEPS:
+        if self.solver.dt != "auto" and self.substeps_for(self.solver.dt) > MAX_SUBSTEPS:
             refuse("solver.dt", self.solver.dt, f"more than {MAX_SUBSTEPS} substeps a frame at {self.fps:g} fps")
         return self
 
@@ -376,16 +374,10 @@ class Scene(Table):
         """Number of samples, at time codes 0 to ``frame_count - 1``; the first is the initial state."""
         return self.frames if self.frames is not None else round((self.duration or 2.0) * self.fps)
 
-    @property
-    def substeps(self) -> int:
-        """Substeps per frame: as many as the largest step that divides a frame and does not exceed ``dt`` takes."""
-        # The tolerance keeps 1/60 s at dt = 1/600 s at ten substeps, whatever the last bit of the quotient.
-        return max(1, math.ceil(1.0 / (self.fps * self.solver.dt) * (1 - 1e-9)))
-
-    @property
-    def dt(self) -> float:
-        """The time step used, s."""
-        return 1.0 / (self.fps * self.substeps)
+    def substeps_for(self, largest: float) -> int:
+        """Return the substeps per frame of the largest step that divides a frame and does not exceed ``largest``, s."""
+        # The tolerance keeps 1/60 s at 1/600 s at ten substeps, whatever the last bit of the quotient.
+        return max(1, math.ceil(1.0 / (self.fps * largest) * (1 - 1e-9)))
 
     @property
     def up(self) -> int:

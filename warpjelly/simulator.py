@@ -12,10 +12,11 @@ import warp as wp
 from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, springs, surfaces
 
 from .device import choose_device
-from .errors import DivergedError
+from .errors import DivergedError, InputError
 from .model import Model, State, build
 from .plan import Plan, plan_scene
-from .scene import Scene
+from .scene import MAX_SUBSTEPS, Scene
+from .stability import SAFETY, add_contacts, measure_pairs, step_limits
 from .surface import SurfaceFrame
 
 log = logging.getLogger("warpjelly")
@@ -46,6 +47,11 @@ class Simulator:
         self.model, self.state = build(plan, device=self.device)
         self.substep_count = 0
         """Substeps since the start."""
+        self._limits: tuple[dict[str, float | None], dict[str, float | None]] | None = None
+        self.substeps = self.scene.substeps_for(self._largest_step())
+        """Substeps per frame."""
+        self.dt = 1.0 / (self.scene.fps * self.substeps)
+        """The time step used, s."""
         chunk_count = len(self.model.chunk_body)
         point_count = len(self.model.surface_particles)
         with wp.ScopedDevice(self.device):
@@ -65,7 +71,7 @@ class Simulator:
     @property
     def time(self) -> float:
         """Simulated time, s."""
-        return self.substep_count * self.scene.dt
+        return self.substep_count * self.dt
 
     @property
     def positions(self) -> np.ndarray:
@@ -89,7 +95,7 @@ class Simulator:
 
     def prepare(self) -> None:
         """Compile and capture what frames need, so that the first one takes no longer than the others."""
-        for substeps in set(self._blocks(self.scene.substeps)):
+        for substeps in set(self._blocks(self.substeps)):
             self._graph(substeps)
 
     def step(self, count: int = 1) -> None:
@@ -108,14 +114,63 @@ class Simulator:
         Raises:
             DivergedError: a position or velocity is not finite any more.
         """
-        self.step(self.scene.substeps)
+        self.step(self.substeps)
         if (particle := self.first_non_finite()) is not None:
             body = next(body for body in self.model.bodies if particle < body.particles.stop)
+            # The limits belong to rest, which is lost: they are named if they were asked for before.
+            broken = self.broken_limit() if self._limits is not None else None
             raise DivergedError(
                 f"the simulation diverged before t = {self.time:.4g} s: particle {particle - body.particles.start} of "
-                f"'{body.name}' left the finite numbers; lower solver.dt (now {self.scene.dt:.3g} s), or stiffness and "
-                "damping of its material or of a collider"
+                f"'{body.name}' left the finite numbers; {f'{broken}; ' if broken else ''}"
+                f"lower solver.dt (now {self.dt:.3g} s), or stiffness and damping of its material or of a collider"
             )
+
+    def step_limits(self, *, contacts: bool) -> dict[str, float | None]:
+        """Return the largest stable step of each integrator, s; None where it has none.
+
+        Belongs to small motions about time zero, so it is to be asked for the first time before the first step.
+
+        Args:
+            contacts: as if each particle touched the worst collider, which is a safe bound; else the springs alone.
+        """
+        if self._limits is None:
+            if self.substep_count > 0:
+                raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
+            pairs = measure_pairs(self.model, self.state.x)
+            self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self.model))
+        return self._limits[contacts]
+
+    def broken_limit(self) -> str | None:
+        """Say which limit the time step exceeds, with both numbers; None if it is within them."""
+        name = self.scene.solver.integrator
+        for touching, where in ((False, "of the springs"), (True, "in contact with a collider")):
+            limit = self.step_limits(contacts=touching)[name]
+            if limit is None:
+                return f"{name} has no stable step {where}, whatever solver.dt"
+            if self.dt > limit:
+                return f"the time step of {self.dt:.4g} s is above the largest stable one {where}, {limit:.4g} s"
+        return None
+
+    def _largest_step(self) -> float:
+        """Return ``solver.dt``, or what "auto" stands for, s."""
+        solver = self.scene.solver
+        if solver.dt != "auto":
+            return solver.dt
+        limits = self.step_limits(contacts=True)
+        limit = limits[solver.integrator]
+        if limit is None:
+            others = ", ".join(name for name, other in limits.items() if other is not None)
+            raise InputError(
+                f'solver.dt = "auto": {solver.integrator} has no stable step for this scene, where something is '
+                f"undamped; integrators that have one: {others}"
+            )
+        step = SAFETY[solver.integrator] * limit
+        if self.scene.substeps_for(step) > MAX_SUBSTEPS:
+            raise InputError(
+                f'solver.dt = "auto": a stable step of {step:.3g} s makes more than {MAX_SUBSTEPS} substeps a frame; '
+                "lower stiffness or damping, or raise the particle mass"
+            )
+        return step
 
     def first_non_finite(self) -> int | None:
         """Return the smallest index of a particle that is not at a finite place or speed, None if all are."""
@@ -217,7 +272,7 @@ class Simulator:
 
     def _blocks(self, count: int) -> list[int]:
         """Cut a number of substeps into those that graphs are captured for: a frame, or a large part of it, and one."""
-        block = min(self.scene.substeps, MAX_CAPTURED_SUBSTEPS)
+        block = min(self.substeps, MAX_CAPTURED_SUBSTEPS)
         return [block] * (count // block) + [1] * (count % block)
 
     def _graph(self, substeps: int) -> Any:
@@ -249,7 +304,7 @@ class Simulator:
         self._launch(
             integrators.semi_implicit_euler,
             model.particle_count,
-            [model.particle_inv_mass, state.f, model.real(self.scene.dt)],
+            [model.particle_inv_mass, state.f, model.real(self.dt)],
             [state.x, state.v],
         )
 
