@@ -19,6 +19,7 @@ from .expect import Observer, Outcome
 from .plan import plan_scene
 from .scene import Scene
 from .simulator import Simulator
+from .stability import evaluations
 from .surface import SurfaceMesh
 from .usd import STAGE_NAME, StageWriter
 
@@ -27,9 +28,8 @@ log = logging.getLogger("warpjelly")
 RECORD_NAME, METRICS_NAME = "run.json", "metrics.csv"
 # A body that starts deeper than this in a collider, in unit cells, is thrown out of it, which is seldom meant.
 DEEP_START = 0.05
-# Finding the largest stable step takes at most as long as this many evaluations of the forces. A run warns of a longer
-# step where these are a small share of its own, or quick anyway, as so many springs are.
-LIMIT_EVALUATIONS = 600
+# A run warns of a step above the limit where finding the limit takes at most this share of it, or at most as long as
+# evaluating the forces of so many springs once each, a second or less.
 LIMIT_SHARE = 0.02
 LIMIT_SPRINGS = 100_000_000
 # How long a forecast measures, s.
@@ -225,8 +225,8 @@ def _warn_of_deep_starts(sim: Simulator) -> None:
 
 
 def _warn_of_long_steps(sim: Simulator) -> None:
-    quick = LIMIT_EVALUATIONS * sim.model.spring_count <= LIMIT_SPRINGS
-    if not quick and LIMIT_EVALUATIONS > LIMIT_SHARE * sim.substeps * sim.scene.frame_count:
+    effort = evaluations(sim.model)
+    if effort * sim.model.spring_count > LIMIT_SPRINGS and effort > LIMIT_SHARE * sim.substeps * sim.scene.frame_count:
         return
     if broken := sim.broken_limit():
         log.warning("%s", broken)
