@@ -188,7 +188,8 @@ class World:
     """A scene of cubes and voxels in motion by semi-implicit Euler."""
 
     def __init__(self, scene: Scene) -> None:
-        self.scene, self.dt, self.steps = scene, scene.dt, 0
+        assert scene.solver.dt != "auto"
+        self.scene, self.dt = scene, 1 / (scene.fps * scene.substeps_for(scene.solver.dt))
         self.keys: list[list[Key]] = []
         xs, vs, ms, bodies, springs, self.starts = [], [], [], [], [], []
         first = 0

@@ -481,7 +481,7 @@ def test_bounce_gains_no_energy(kind: str, damping: float, device: str) -> None:
     # is, at most the energy above the lowest point reached. w^2 <= w_springs^2 + k_c/m; and 10 % for the bends.
     frequency = np.sqrt(world.top_frequency() ** 2 + 1000.0 / 0.01)
     swing = energy[0] - weight * (height.min() - 0.1)
-    bound = 1.1 * frequency * scene.dt / 2 * swing
+    bound = 1.1 * frequency * simulator.dt / 2 * swing
     assert touched.any()
     assert energy.max() - energy[0] <= bound
     after = np.flatnonzero(touched)[0]

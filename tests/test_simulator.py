@@ -31,7 +31,7 @@ def test_free_fall_follows_the_sum_of_the_scheme(precision: str, device: str) ->
     """Fall by x0 + v0 n dt + g dt^2 n (n + 1) / 2, which is what semi-implicit Euler makes of free fall."""
     body = make_cube(velocity=[1.0, 2.0, -3.0], position=[0.5, 2.0, 0.0])
     simulator = Simulator(make_scene(bodies=[body], gravity=GRAVITY, solver={"precision": precision}), device=device)
-    x0, n, dt = simulator.positions.astype(float), 500, simulator.scene.dt
+    x0, n, dt = simulator.positions.astype(float), 500, simulator.dt
     simulator.step(n)
     expected = x0 + np.array(body["velocity"]) * n * dt + np.array(GRAVITY) * dt**2 * n * (n + 1) / 2
     # Each step rounds x by half an epsilon of up to 4 m and v by one of up to 8 m/s, which acts on x for n dt.
@@ -72,7 +72,7 @@ def test_cube_breathes_as_the_scheme_says(law: str, damping: float, precision: s
     """Breathe at arccos(1 - (w dt)^2 / 2) / dt when undamped, and fade by (1 - c dt)^(1/2) a step when damped."""
     scene, w2, c = breathe(law, damping, precision)
     simulator = Simulator(scene, device=device)
-    rest, dt, start = simulator.positions.astype(float), scene.dt, 0.25
+    rest, dt, start = simulator.positions.astype(float), simulator.dt, 0.25
     set_state(simulator, x=(1 + start) * rest)
     # s(n+1) = s(n) + dt s'(n+1) and s'(n+1) = (1 - c dt) s'(n) - w2 dt s(n) have the characteristic equation
     # z^2 - (2 - c dt - w2 dt^2) z + (1 - c dt) = 0, with z = q exp(+-i phi), and s(1) = (1 - w2 dt^2) s(0).
@@ -111,7 +111,7 @@ def test_rotation_and_momentum_last_in_free_flight(precision: str, device: str) 
         simulator.step(20)
         moved = max(moved, (m * np.abs(simulator.velocities)).sum())
         forces = max(forces, np.abs(simulator.forces).sum())
-    after, dt = simulator.diagnostics(), simulator.scene.dt
+    after, dt = simulator.diagnostics(), simulator.dt
     bound = EPSILON[precision] * steps * (moved + 10 * forces * dt)
     assert np.abs(before["angular_momentum"]).max() > 1e-2
     assert after["elastic"] > 0
@@ -137,7 +137,7 @@ def test_energy_of_an_undamped_cube_is_bounded(law: str, device: str) -> None:
         now = simulator.diagnostics()
         energies.append(now["kinetic"] + now["elastic"])
     # The scheme conserves H + dt/2 v.F of linear springs, and |v.F| <= w H in each mode; at rest v.F = 0.
-    bound = 1.1 * world.top_frequency() * scene.dt / 2
+    bound = 1.1 * world.top_frequency() * simulator.dt / 2
     drift = np.abs(np.array(energies) / start["elastic"] - 1)
     assert drift.max() <= bound
     # The bound is of use.
@@ -292,8 +292,8 @@ def test_grouping_of_steps_does_not_matter(precision: str) -> None:
 def test_long_frames_replay_their_graph(device: str) -> None:
     """Advance a frame of more substeps than a graph holds by exactly that many."""
     scene = make_scene(bodies=[make_cube(velocity=[1.0, 0.0, 0.0])], fps=5.0)
-    assert scene.substeps == 200 > MAX_CAPTURED_SUBSTEPS
     simulator = Simulator(scene, device=device)
+    assert simulator.substeps == 200 > MAX_CAPTURED_SUBSTEPS
     start = simulator.positions
     simulator.advance_frame()
     assert simulator.substep_count == 200
@@ -389,7 +389,7 @@ def test_time_counts_substeps(device: str) -> None:
     """Count time in steps of 1/(fps substeps) s, with as few substeps as dt allows."""
     # 1/60 s in steps of at most 3 ms: six of 1/360 s.
     simulator = Simulator(make_scene(fps=60.0, solver={"dt": 3e-3}), device=device)
-    assert simulator.scene.substeps == 6
+    assert simulator.substeps == 6
     assert simulator.time == 0
     simulator.step(3)
     assert simulator.time == pytest.approx(3 / 360, rel=1e-15)
@@ -453,8 +453,10 @@ def test_forces_are_those_of_the_last_substep(precision: str, device: str) -> No
         before = simulator.velocities.astype(float)
         simulator.step(1)
         # v is rounded by half an epsilon, twice; m/dt makes a force of it.
-        change = (simulator.velocities - before) / scene.dt * world.m[:, None]
-        bound = EPSILON[precision] * (2 * np.abs(before).max() / scene.dt * world.m.max() + np.abs(change).max() * 4)
+        change = (simulator.velocities - before) / simulator.dt * world.m[:, None]
+        bound = EPSILON[precision] * (
+            2 * np.abs(before).max() / simulator.dt * world.m.max() + np.abs(change).max() * 4
+        )
         np.testing.assert_allclose(simulator.forces, change, rtol=0, atol=bound)
 
 

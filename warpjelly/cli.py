@@ -146,6 +146,9 @@ def check(
     print(f"  springs    {figures['springs']:>13,}")
     print(f"  memory     {figures['memory_bytes'] / 1e9:>13.2f} GB at the peak, about")
     print(f"  step       {figures['dt'] * 1e3:>13.4g} ms, {figures['substeps']} a frame, {figures['frames']} frames")
+    for name, limit in figures["dt_limit"].items():
+        steps = [f"{step * 1e3:.4g} ms" if step else "none" for step in (limit, figures["dt_limit_in_contact"][name])]
+        print(f"  {name:<19} {steps[0]:>10} is its largest stable step; in contact {steps[1]}")
     print(f"  time       {figures['seconds']:>13.3g} s on {figures['device']}, about, stage included")
 
 

@@ -19,6 +19,7 @@ from .files import whole_file
 from .plan import plan_scene
 from .scene import Scene
 from .simulator import Simulator
+from .stability import evaluations
 from .surface import SurfaceMesh
 from .usd import STAGE_NAME, StageWriter
 
@@ -27,6 +28,10 @@ log = logging.getLogger("warpjelly")
 RECORD_NAME, METRICS_NAME = "run.json", "metrics.csv"
 # A body that starts deeper than this in a collider, in unit cells, is thrown out of it, which is seldom meant.
 DEEP_START = 0.05
+# A run warns of a step above the limit where finding the limit takes at most this share of it, or at most as long as
+# evaluating the forces of so many springs once each, a second or less.
+LIMIT_SHARE = 0.02
+LIMIT_SPRINGS = 100_000_000
 # How long a forecast measures, s.
 FORECAST_SECONDS = 0.3
 
@@ -105,6 +110,8 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         SurfaceMesh(body.name, surface.points, surface.normals, body.quads)
         for body, surface in zip(sim.model.bodies, sim.surfaces(), strict=True)
     ]
+    _warn_of_deep_starts(sim)
+    _warn_of_long_steps(sim)
     writer = StageWriter(folder / STAGE_NAME, scene=scene, meshes=meshes, provenance=provenance(scene, sim))
     observer = Observer(sim)
     sim.prepare()
@@ -131,7 +138,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
     finally:
         # Whatever happens, also what nobody foresaw: the frames that were finished are saved.
         writer.close()
-    evaluations = max(frames - 1, 0) * scene.substeps
+    evaluations = max(frames - 1, 0) * sim.substeps
     outcomes = observer.outcomes()
     record = {
         "scene": scene.name,
@@ -142,8 +149,8 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         "particles": sim.model.particle_count,
         "springs": sim.model.spring_count,
         "voxels": sim.model.voxel_count,
-        "substeps": scene.substeps,
-        "dt": scene.dt,
+        "substeps": sim.substeps,
+        "dt": sim.dt,
         "precision": scene.solver.precision,
         "wall_seconds": time.perf_counter() - began,
         "springs_per_second": sim.model.spring_count * evaluations / stepping if evaluations else 0.0,
@@ -167,7 +174,8 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
 
     Returns:
         ``particles, springs, voxels``; ``memory_bytes``, an estimate of the peak; ``dt`` [s], ``substeps`` a frame,
-        ``frames``; ``seconds``, an estimate from this machine's speed now; ``device``.
+        ``frames``; ``dt_limit`` and ``dt_limit_in_contact``, the largest stable step by integrator, s or None;
+        ``seconds``, an estimate from this machine's speed now; ``device``.
 
     Raises:
         InputError: the scene cannot be built.
@@ -175,13 +183,15 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     plan = plan_scene(scene)
     sim = Simulator(plan, device=device)
     _warn_of_deep_starts(sim)
+    if broken := sim.broken_limit():
+        log.warning("%s", broken)
     sim.step()
     sim.surfaces()
     sim.diagnostics()
     began = time.perf_counter()
     sim.step()
     # Whole frames where they are quick, as a run does them; single substeps where a frame would take too long.
-    count = scene.substeps if scene.substeps * (time.perf_counter() - began) < FORECAST_SECONDS else 1
+    count = sim.substeps if sim.substeps * (time.perf_counter() - began) < FORECAST_SECONDS else 1
     sim.prepare()
     began, substeps = time.perf_counter(), 0
     while substeps == 0 or time.perf_counter() - began < FORECAST_SECONDS:
@@ -190,15 +200,17 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     stepped = time.perf_counter()
     sim.surfaces()
     sim.diagnostics()
-    frame = (stepped - began) / substeps * scene.substeps + time.perf_counter() - stepped
+    frame = (stepped - began) / substeps * sim.substeps + time.perf_counter() - stepped
     return {
         "scene": scene.name,
         "voxels": sim.model.voxel_count,
         "particles": sim.model.particle_count,
         "springs": sim.model.spring_count,
         "memory_bytes": plan.memory_bytes,
-        "dt": scene.dt,
-        "substeps": scene.substeps,
+        "dt": sim.dt,
+        "dt_limit": sim.step_limits(contacts=False),
+        "dt_limit_in_contact": sim.step_limits(contacts=True),
+        "substeps": sim.substeps,
         "frames": scene.frame_count,
         "seconds": frame * (scene.frame_count - 1),
         "device": sim.device,

@@ -48,6 +48,7 @@ Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_LE
 Length = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_LENGTH, le=MAX_LENGTH)]
 Mass = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_MASS, le=MAX_MAGNITUDE)]
 Rate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_RATE, le=MAX_RATE)]
+Step = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-9, le=1.0)]
 Vector = tuple[Number, Number, Number]
 Rates = tuple[Rate, Rate, Rate]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -82,11 +83,8 @@ class Solver(Table):
     )
     dt: float = Field(
         1e-3,
-        strict=True,
-        ge=1e-9,
-        le=1.0,
-        allow_inf_nan=False,
-        description="largest time step, s; the step used is the largest one below it that divides a frame",
+        description="largest time step, s; the step used is the largest one below it that divides a frame; "
+        "auto: a safe share of the largest stable step",
     )
     precision: Literal["float32", "float64"] = Field("float32", description="floating-point type of the simulation")
     culling: Switch = Field(
@@ -581,10 +579,12 @@ class Scene(Table):
         if self.duration is not None and not 1 <= round(self.duration * self.fps) <= MAX_FRAMES:
             refuse("duration", self.duration, f"at {self.fps:g} fps this is not between 1 and {MAX_FRAMES} frames")
         steps = self.solver.steps_per_frame
+        if steps is not None and self.solver.dt == "auto":
+            refuse("solver.dt", "auto", "give a number with solver.steps_per_frame")
         if steps is not None and not math.isclose(self.fps * steps * self.solver.dt, 1.0, rel_tol=1e-9):
             fps = 1.0 / (steps * self.solver.dt)
             refuse("fps", self.fps, f"leave it out; solver.steps_per_frame and solver.dt make it {fps:.9g}")
-        if self.substeps > MAX_SUBSTEPS:
+        if self.solver.dt != "auto" and self.substeps_for(self.solver.dt) > MAX_SUBSTEPS:
             refuse("solver.dt", self.solver.dt, f"more than {MAX_SUBSTEPS} substeps a frame at {self.fps:g} fps")
         return self
 
@@ -593,20 +593,18 @@ class Scene(Table):
         """Number of samples, at time codes 0 to ``frame_count - 1``; the first is the initial state."""
         return self.frames if self.frames is not None else round((self.duration or 2.0) * self.fps)
 
-    @property
-    def substeps(self) -> int:
-        """Substeps per frame: as many as the largest step that divides a frame and does not exceed ``dt`` takes."""
+    def substeps_for(self, largest: float) -> int:
+        """Return the substeps per frame of the largest step that divides a frame and does not exceed ``largest``, s."""
         if self.solver.steps_per_frame is not None:
             return self.solver.steps_per_frame
-        # The tolerance keeps 1/60 s at dt = 1/600 s at ten substeps, whatever the last bit of the quotient.
-        return max(1, math.ceil(1.0 / (self.fps * self.solver.dt) * (1 - 1e-9)))
+        # The tolerance keeps 1/60 s at 1/600 s at ten substeps, whatever the last bit of the quotient.
+        return max(1, math.ceil(1.0 / (self.fps * largest) * (1 - 1e-9)))
 
-    @property
-    def dt(self) -> float:
-        """The time step used, s."""
-        if self.solver.steps_per_frame is not None:
+    def dt_for(self, substeps: int) -> float:
+        """Return the time step of so many substeps per frame, s; with ``solver.steps_per_frame`` it is dt, exactly."""
+        if self.solver.steps_per_frame is not None and self.solver.dt != "auto":
             return self.solver.dt
-        return 1.0 / (self.fps * self.substeps)
+        return 1.0 / (self.fps * substeps)
 
     @property
     def up(self) -> int:

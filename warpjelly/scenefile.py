@@ -127,7 +127,7 @@ def _key(location: tuple[int | str, ...]) -> str:
     parts = [str(part) for part in location]
     if len(parts) > 2 and parts[0] in ("bodies", "colliders", "fields"):
         del parts[2]
-    return ".".join(part for part in parts if "[" not in part and not part.startswith("literal"))
+    return ".".join(part for part in parts if "[" not in part and not part.startswith(("literal", "constrained")))
 
 
 def _described(location: tuple[int | str, ...]) -> str:

@@ -12,10 +12,11 @@ import warp as wp
 from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, springs, surfaces
 
 from .device import choose_device
-from .errors import DivergedError
+from .errors import DivergedError, InputError
 from .model import Model, State, build
 from .plan import Plan, plan_scene
-from .scene import Scene
+from .scene import MAX_SUBSTEPS, Scene
+from .stability import SAFETY, add_contacts, measure_pairs, step_limits
 from .surface import SurfaceFrame
 
 log = logging.getLogger("warpjelly")
@@ -48,6 +49,11 @@ class Simulator:
             self.model, self.state = build(plan, device=self.device)
         self.substep_count = 0
         """Substeps since the start."""
+        self._limits: tuple[dict[str, float | None], dict[str, float | None]] | None = None
+        self.substeps = self.scene.substeps_for(self._largest_step())
+        """Substeps per frame."""
+        self.dt = self.scene.dt_for(self.substeps)
+        """The time step used, s."""
         chunk_count = len(self.model.chunk_body)
         point_count = len(self.model.surface_particles)
         with wp.ScopedDevice(self.device):
@@ -79,7 +85,7 @@ class Simulator:
     @property
     def time(self) -> float:
         """Simulated time, s."""
-        return self.substep_count * self.scene.dt
+        return self.substep_count * self.dt
 
     @property
     def positions(self) -> np.ndarray:
@@ -108,7 +114,7 @@ class Simulator:
 
     def step(self, count: int = 1) -> None:
         """Advance by a number of substeps."""
-        frames, rest = divmod(count, self.scene.substeps)
+        frames, rest = divmod(count, self.substeps)
         for substeps in self._frame_blocks() * frames + [1] * rest:
             if (graph := self._graph(substeps)) is not None:
                 wp.capture_launch(graph)
@@ -123,13 +129,16 @@ class Simulator:
         Raises:
             DivergedError: a position or velocity is not finite any more, or absurd.
         """
-        self.step(self.scene.substeps)
+        self.step(self.substeps)
         if (particle := self.first_lost()) is not None:
             body = next(body for body in self.model.bodies if particle < body.particles.stop)
+            # The limits belong to rest, which is lost: they are named if they were asked for before.
+            broken = self.broken_limit() if self._limits is not None else None
             raise DivergedError(
                 f"the simulation diverged before t = {self.time:.4g} s: particle {particle - body.particles.start} of "
-                f"'{body.name}' is beyond {diagnostics.MAX_DISTANCE:g} m or {diagnostics.MAX_SPEED:g} m/s; lower "
-                f"solver.dt (now {self.scene.dt:.3g} s), or stiffness and damping of its material or of a collider"
+                f"'{body.name}' is beyond {diagnostics.MAX_DISTANCE:g} m or {diagnostics.MAX_SPEED:g} m/s; "
+                f"{f'{broken}; ' if broken else ''}lower solver.dt (now {self.dt:.3g} s), or stiffness and damping of "
+                "its material or of a collider"
             )
 
     def first_lost(self) -> int | None:
@@ -138,6 +147,53 @@ class Simulator:
         self._launch(diagnostics.find_lost, self.model.particle_count, [self.state.x, self.state.v], [self._lost])
         first = int(self._lost.numpy()[0])
         return first if first < self.model.particle_count else None
+
+    def step_limits(self, *, contacts: bool) -> dict[str, float | None]:
+        """Return the largest stable step of each integrator, s; None where it has none.
+
+        Belongs to small motions about time zero, so it is to be asked for the first time before the first step.
+
+        Args:
+            contacts: as if each particle touched the worst collider, which is a safe bound; else the springs alone.
+        """
+        if self._limits is None:
+            if self.substep_count > 0:
+                raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
+            pairs = measure_pairs(self.model, self.state.x)
+            self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self.model))
+        return self._limits[contacts]
+
+    def broken_limit(self) -> str | None:
+        """Say which limit the time step exceeds, with both numbers; None if it is within them."""
+        name = self.scene.solver.integrator
+        for touching, where in ((False, "of the springs"), (True, "in contact with a collider")):
+            limit = self.step_limits(contacts=touching)[name]
+            if limit is None:
+                return f"{name} has no stable step {where}, whatever solver.dt"
+            if self.dt > limit:
+                return f"the time step of {self.dt:.4g} s is above the largest stable one {where}, {limit:.4g} s"
+        return None
+
+    def _largest_step(self) -> float:
+        """Return ``solver.dt``, or what "auto" stands for, s."""
+        solver = self.scene.solver
+        if solver.dt != "auto":
+            return solver.dt
+        limits = self.step_limits(contacts=True)
+        limit = limits[solver.integrator]
+        if limit is None:
+            others = ", ".join(name for name, other in limits.items() if other is not None)
+            raise InputError(
+                f'solver.dt = "auto": {solver.integrator} has no stable step for this scene, where something is '
+                f"undamped; integrators that have one: {others}"
+            )
+        step = SAFETY[solver.integrator] * limit
+        if self.scene.substeps_for(step) > MAX_SUBSTEPS:
+            raise InputError(
+                f'solver.dt = "auto": a stable step of {step:.3g} s makes more than {MAX_SUBSTEPS} substeps a frame; '
+                "lower stiffness or damping, or raise the particle mass"
+            )
+        return step
 
     def diagnostics(self) -> dict[str, Any]:
         """Measure the current state.
@@ -238,8 +294,8 @@ class Simulator:
 
     def _frame_blocks(self) -> list[int]:
         """Cut the substeps of a frame into blocks that graphs are captured for, of at most two sizes."""
-        blocks = -(-self.scene.substeps // MAX_CAPTURED_SUBSTEPS)
-        short, longer = divmod(self.scene.substeps, blocks)
+        blocks = -(-self.substeps // MAX_CAPTURED_SUBSTEPS)
+        short, longer = divmod(self.substeps, blocks)
         return [short + 1] * longer + [short] * (blocks - longer)
 
     def _graph(self, substeps: int) -> Any:
@@ -264,14 +320,14 @@ class Simulator:
 
     def _substep(self) -> None:
         if self.scene.solver.integrator == "semi_implicit_euler":
-            self._add_forces(loss_weight=self.scene.dt)
-            self._integrate(self.scene.dt)
+            self._add_forces(loss_weight=self.dt)
+            self._integrate(self.dt)
         else:
             stages = integrators.STAGES[self.scene.solver.integrator]
             for number, (share, weight, reach) in enumerate(stages):
                 first, last = number == 0, number == len(stages) - 1
-                self._add_forces(loss_weight=weight * self.scene.dt, offset=share * self.scene.dt, first=first)
-                self._integrate_stage(self.scene.dt, weight, reach, first=first, last=last)
+                self._add_forces(loss_weight=weight * self.dt, offset=share * self.dt, first=first)
+                self._integrate_stage(self.dt, weight, reach, first=first, last=last)
         self._launch(integrators.count_step, 1, [], [self.state.step])
 
     def _integrate(self, dt: float) -> None:
@@ -312,7 +368,7 @@ class Simulator:
                 model.particle_count,
                 [
                     *(model.particle_charge, model.fields, state.step, state.x, state.v),
-                    *(wp.float64(self.scene.dt), wp.float64(offset), wp.float64(loss_weight)),
+                    *(wp.float64(self.dt), wp.float64(offset), wp.float64(loss_weight)),
                 ],
                 [state.f, state.field_work],
             )
@@ -333,7 +389,7 @@ class Simulator:
             [
                 *(model.particle_mass, model.chunk_start, model.chunk_body, model.colliders),
                 *(self._lower, self._upper, state.x_start, state.x, state.v, state.step),
-                *(model.real(self.scene.dt), weight, first, self.scene.solver.culling, lanes),
+                *(model.real(self.dt), weight, first, self.scene.solver.culling, lanes),
             ],
             [state.stamps, state.normals, state.f, state.contact_losses],
         )

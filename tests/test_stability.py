@@ -1,0 +1,341 @@
+"""The largest stable step: against dense matrices, and against what blows up and what does not."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from reference import World
+from worlds import make_material, make_scene, set_state
+
+from warpjelly import stability
+from warpjelly.errors import DivergedError, InputError
+from warpjelly.run import forecast, simulate
+from warpjelly.scene import Scene
+from warpjelly.simulator import Simulator
+
+MODELS = Path(__file__).parent.parent / "scenes" / "models"
+INTEGRATORS = stability.INTEGRATORS
+ALL_LIMITED = make_material(400.0, 0.6)
+UNDAMPED = make_material(400.0, 0.0)
+# Another damping / stiffness for each kind of spring.
+MIXED = {
+    "structural": {"stiffness": 30.0, "damping": 0.2},
+    "shear": {"stiffness": 20.0, "damping": 0.3},
+    "bend": {"stiffness": 10.0, "damping": 0.05},
+}
+
+
+def make_cube(count: int, material: dict[str, Any], **changes: Any) -> Scene:
+    """Return a scene of one cube with some particles per edge."""
+    body = {"name": "cube", "type": "cube", "material": "jelly", "particles_per_edge": count}
+    return make_scene(bodies=[body], materials={"jelly": material}, **changes)
+
+
+def make_tree(material: dict[str, Any], **changes: Any) -> Scene:
+    """Return a scene of the tree at resolution 12."""
+    body = {"name": "tree", "type": "model", "file": str(MODELS / "tree.obj"), "resolution": 12, "material": "jelly"}
+    return make_scene(bodies=[body], materials={"jelly": material}, **changes)
+
+
+def limits_of(scene: Scene, device: str = "cpu") -> dict[str, float | None]:
+    """Return the limits of the springs of a scene."""
+    return Simulator(scene, device=device).step_limits(contacts=False)
+
+
+class Matrices:
+    """The springs of a simulator at rest as dense matrices: y'' = -A y - B y' with y the root of the mass times x."""
+
+    def __init__(self, simulator: Simulator) -> None:
+        x, m = simulator.positions.astype(float), simulator.masses.astype(float)
+        self.a, self.b = np.zeros((2, 3 * len(x), 3 * len(x)))
+        classes = simulator.model.spring_classes.numpy().astype(float)
+        for first, second, count, kind in simulator.model.spans.numpy():
+            for i, j in zip(range(first, first + count), range(second, second + count), strict=True):
+                n = x[j] - x[i]
+                g = np.zeros(6)
+                g[:3], g[3:] = n / math.sqrt(m[i]), -n / math.sqrt(m[j])
+                at = np.r_[3 * i : 3 * i + 3, 3 * j : 3 * j + 3]
+                block = np.outer(g, g) / (n @ n)
+                self.a[np.ix_(at, at)] += classes[kind, 1] * block
+                self.b[np.ix_(at, at)] += classes[kind, 2] * block
+
+    def step_matrix(self, integrator: str, dt: float) -> np.ndarray:
+        """Return the matrix that advances (y, y') by one step."""
+        one, none = np.eye(len(self.a)), np.zeros_like(self.a)
+        if integrator == "semi_implicit_euler":
+            v = np.hstack([-dt * self.a, one - dt * self.b])
+            return np.vstack([np.hstack([one, none]) + dt * v, v])
+        z = dt * np.block([[none, one], [-self.a, -self.b]])
+        step = term = np.eye(len(z))
+        for order in range(1, {"explicit_euler": 1, "rk2": 2, "rk4": 4}[integrator] + 1):
+            term = term @ z / order
+            step = step + term
+        return step
+
+    def growth(self, integrator: str, share: float, limit: float, doublings: int = 13) -> float:
+        """Return by how much 2^doublings steps at a share of the limit make a random start in shape grow.
+
+        The start leaves out the motions as a rigid body, which drift for ever, with any step and without any harm.
+        """
+        step = self.step_matrix(integrator, share * limit)
+        for _ in range(doublings):
+            step = step @ step
+            if not np.abs(step).max() < 1e100:
+                return math.inf
+        values, modes = np.linalg.eigh(self.a + self.b)
+        shapes = modes[:, values > 1e-9 * values[-1]]
+        # Positions in units of velocity over the top frequency, so that both count alike.
+        scale = math.sqrt(np.linalg.eigvalsh(self.a)[-1]) or 1.0
+        start = np.random.default_rng(1).standard_normal(shapes.shape[1] * 2).reshape(2, -1)
+        y = np.concatenate([shapes @ start[0] / scale, shapes @ start[1]])
+        size = np.repeat([scale, 1.0], len(self.a))
+        return float(np.linalg.norm(size * (step @ y)) / np.linalg.norm(size * y))
+
+
+@pytest.mark.parametrize("damped", [False, True])
+def test_lanczos_finds_the_top_of_the_assembled_matrix(damped: bool, precision: str, device: str) -> None:
+    """Find the top eigenvalue within 1 % from below, and damping / stiffness times it."""
+    material = make_material(400.0, 0.6 if damped else 0.0, density=300.0)
+    simulator = Simulator(make_cube(5, material, solver={"precision": precision}), device=device)
+    origin, (top, damping) = stability.measure_pairs(simulator.model, simulator.state.x)
+    expected = np.linalg.eigvalsh(Matrices(simulator).a)[-1]
+    assert (origin == 0).all()
+    # Rounding can put it above by some epsilons.
+    assert 0.99 * expected <= top <= expected * (1 + 1e-5)
+    assert damping == pytest.approx(0.0015 * top if damped else 0.0, rel=1e-6)
+
+
+def test_the_polygon_holds_the_pairs_of_unequal_springs() -> None:
+    """Enclose (a, d) of random shapes and of the top modes, within 2 % of the top values."""
+    simulator = Simulator(make_cube(4, MIXED), device="cpu")
+    matrices = Matrices(simulator)
+    pairs = stability.measure_pairs(simulator.model, simulator.state.x)
+    scale = pairs.max(axis=0)
+    tops = [np.linalg.eigvalsh(matrix)[-1] for matrix in (matrices.a, matrices.b)]
+    np.testing.assert_allclose(scale, tops, rtol=0.01)
+    y = [np.linalg.eigh(math.cos(t) * matrices.a / scale[0] + math.sin(t) * matrices.b / scale[1])[1].T
+         for t in np.linspace(0, 2 * math.pi, 25)]  # fmt: skip
+    found = np.array([[v @ matrices.a @ v, v @ matrices.b @ v] for vectors in y for v in vectors]) / scale
+    edges = np.roll(pairs, -1, axis=0) / scale - pairs / scale
+    outward = np.stack([edges[:, 1], -edges[:, 0]], axis=1)
+    outward /= np.maximum(np.linalg.norm(outward, axis=1), 1e-12)[:, None]
+    outside = ((found[:, None] - pairs / scale) * outward).sum(axis=2)
+    # Lanczos is within 1 % from below.
+    assert outside.max() <= 0.01
+
+
+MATERIALS = {
+    "damped": ALL_LIMITED,
+    "lightly damped": make_material(400.0, 0.2),
+    "undamped": UNDAMPED,
+    "mixed": MIXED,
+    "dampers": make_material(0.0, 0.3),
+    "no bend stiffness": MIXED | {"bend": {"stiffness": 0.0, "damping": 0.3}},
+}
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_the_limit_is_neither_unsafe_nor_timid(name: str, integrator: str) -> None:
+    """Stay bounded for 8192 linear steps at 0.95 of the limit, and blow up at 1.3 of it."""
+    simulator = Simulator(make_cube(4, MATERIALS[name]), device="cpu")
+    limit = simulator.step_limits(contacts=False)[integrator]
+    if name == "undamped" and integrator in ("explicit_euler", "rk2"):
+        assert limit is None
+        return
+    assert limit is not None
+    matrices = Matrices(simulator)
+    # A stable step is a contraction in some norm; near the limit that of y and y' over the top frequency is within the
+    # inverse root of the distance from it, 0.05^-0.5 = 4.5, for one mode, and 10 leaves room for several.
+    assert matrices.growth(integrator, 0.95, limit) < 10
+    assert matrices.growth(integrator, 1.3, limit) > 1e6
+
+
+@pytest.mark.parametrize("damping", [0.0, 0.2])
+@pytest.mark.parametrize("body", ["cube", "unequal cube", "tree"])
+def test_the_simulator_obeys_the_limit(body: str, damping: float) -> None:
+    """Keep a small perturbation small for 5000 steps at 0.95 of the limit, and blow it up at 1.3 of it."""
+    material = make_material(100.0, damping)
+    if body == "unequal cube":
+        material = {kind: {name: value * factor for name, value in material[kind].items()}
+                    for kind, factor in (("structural", 1.0), ("shear", 3.0), ("bend", 0.2))}  # fmt: skip
+        # Another damping / stiffness for the shear springs.
+        material["shear"]["damping"] *= 0.3
+
+    def build(dt: float) -> Simulator:
+        # A frame is one step, of exactly this length.
+        changes: dict[str, Any] = {"solver": {"dt": dt}, "fps": 1 / dt}
+        count = 8 if body == "cube" else 5
+        return Simulator(make_tree(material, **changes) if body == "tree" else make_cube(count, material, **changes))
+
+    limit = build(1e-3).step_limits(contacts=False)["semi_implicit_euler"]
+    assert limit is not None
+    rng, scale = np.random.default_rng(5), 1e-6
+    for share, bounded in ((0.95, True), (1.3, False)):
+        simulator = build(share * limit)
+        assert simulator.dt == pytest.approx(share * limit, rel=1e-12)
+        rest = simulator.positions
+        start = rest + scale * simulator.model.bodies[0].unit * rng.standard_normal(rest.shape)
+        set_state(simulator, x=start)
+        first = simulator.diagnostics()["elastic"]
+        simulator.step(5000)
+        if bounded:
+            # The scheme conserves H + dt/2 v.F of linear springs, which differs from H by up to w dt/2 = 0.95 of it:
+            # H stays within (1 + 0.95) / (1 - 0.95) = 39 times the first. Damping takes away.
+            now = simulator.diagnostics()
+            assert now["elastic"] + now["kinetic"] <= 39 * first
+        else:
+            largest = np.abs(simulator.positions - rest).max()
+            assert not largest < 1e3 * scale
+
+
+def test_the_limit_falls_with_the_roots_of_stiffness_and_mass(precision: str) -> None:
+    """Halve the step of undamped springs with 4 times the stiffness, and double it with 4 times the mass."""
+    limits = [
+        limits_of(make_cube(4, make_material(k, 0.0, particle_mass=m), solver={"precision": precision}))
+        for k, m in ((100.0, 0.01), (400.0, 0.01), (100.0, 0.04))
+    ]
+    for integrator in ("semi_implicit_euler", "rk4"):
+        once, stiff, heavy = (limit[integrator] for limit in limits)
+        # Lanczos takes the same steps but for rounding.
+        assert stiff == pytest.approx(once / 2, rel=1e-4)
+        assert heavy == pytest.approx(once * 2, rel=1e-4)
+
+
+def test_contact_alone_gives_the_limits_of_an_oscillator() -> None:
+    """Find the limits of k = 50 N/m and c = 0.1 N s/m on 0.01 kg where no spring does anything."""
+    floor = {"type": "half_space", "normal": [0.0, 1.0, 0.0], "stiffness": 50.0, "damping": 0.1}
+    simulator = Simulator(make_cube(2, make_material(0.0, 0.0), colliders=[floor]), device="cpu")
+    assert simulator.step_limits(contacts=False) == dict.fromkeys(INTEGRATORS, stability.MAX_STEP)
+    a, d = 50.0 / 0.01, 0.1 / 0.01
+    limits = simulator.step_limits(contacts=True)
+    assert limits["explicit_euler"] == pytest.approx(d / a, rel=1e-6)
+    assert limits["semi_implicit_euler"] == pytest.approx((-d + math.sqrt(d * d + 4 * a)) / a, rel=1e-6)
+    for integrator, coefficients in (("rk2", [1 / 2, 1, 1]), ("rk4", [1 / 24, 1 / 6, 1 / 2, 1, 1])):
+        limit = limits[integrator]
+        assert limit is not None
+        mu = -d / 2 + 1j * math.sqrt(a - d * d / 4)
+        assert abs(np.polyval(coefficients, 0.999 * limit * mu)) < 1 < abs(np.polyval(coefficients, 1.001 * limit * mu))
+
+
+def test_pinned_particles_do_not_move() -> None:
+    """Leave particles of zero inverse mass out: a body held at one end is not less stable than a free one."""
+    simulator = Simulator(make_cube(4, ALL_LIMITED), device="cpu")
+    free = stability.measure_pairs(simulator.model, simulator.state.x)[1, 0]
+    inverse = simulator.model.particle_inv_mass.numpy().copy()
+    inverse[simulator.positions[:, 0] < 0.0] = 0.0
+    simulator.model.particle_inv_mass.assign(inverse)
+    held = stability.measure_pairs(simulator.model, simulator.state.x)[1, 0]
+    kept = np.repeat(inverse > 0, 3)
+    expected = np.linalg.eigvalsh(Matrices(simulator).a[np.ix_(kept, kept)])[-1]
+    assert 0.99 * expected <= held <= expected * (1 + 1e-9)
+    assert held < free
+    simulator.model.particle_inv_mass.zero_()
+    assert stability.measure_pairs(simulator.model, simulator.state.x)[1, 0] == 0
+
+
+def test_auto_takes_a_safe_step_that_divides_the_frame() -> None:
+    """Take half the limit in contact, rounded down to a part of the frame."""
+    floor = {"type": "half_space", "normal": [0.0, 1.0, 0.0], "center": [0.0, -3.0, 0.0]}
+    simulator = Simulator(make_cube(4, ALL_LIMITED, solver={"dt": "auto"}, colliders=[floor]), device="cpu")
+    limit = simulator.step_limits(contacts=True)["semi_implicit_euler"]
+    assert limit is not None
+    assert limit < simulator.step_limits(contacts=False)["semi_implicit_euler"]
+    assert simulator.dt == pytest.approx(1 / (100 * simulator.substeps), rel=1e-15)
+    assert simulator.dt <= stability.SAFETY["semi_implicit_euler"] * limit < 1 / (100 * (simulator.substeps - 1))
+    simulator.advance_frame()
+    assert simulator.time == pytest.approx(0.01, rel=1e-12)
+
+
+def test_auto_names_the_integrators_that_would_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refuse an integrator without a stable step."""
+
+    def without(pairs: np.ndarray) -> dict[str, float | None]:
+        return dict.fromkeys(INTEGRATORS, None) | {"rk4": 1e-3}
+
+    monkeypatch.setattr("warpjelly.simulator.step_limits", without)
+    with pytest.raises(InputError, match=r'solver.dt = "auto".*semi_implicit_euler.*rk4'):
+        Simulator(make_cube(2, UNDAMPED, solver={"dt": "auto"}), device="cpu")
+
+
+def test_auto_survives_compression() -> None:
+    """Stay bounded for 5000 steps after squeezing an undamped cube to 70 % of its height."""
+    simulator = Simulator(make_cube(6, UNDAMPED, solver={"dt": "auto"}), device="cpu")
+    set_state(simulator, x=simulator.positions * [1.0, 0.7, 1.0])
+    first = simulator.diagnostics()["elastic"]
+    simulator.step(5000)
+    after = simulator.diagnostics()
+    # At half the limit w dt / 2 = 0.5: H stays within (1 + 0.5) / (1 - 0.5) of the first.
+    assert after["elastic"] + after["kinetic"] <= 3 * first
+
+
+def test_auto_survives_a_fast_throw_into_a_corner() -> None:
+    """Stay finite after a throw of an undamped cube at 10 m/s into a corner of a room that does not damp either."""
+    material = make_material(400.0, 0.0)
+    body = {"type": "cube", "material": "jelly", "particles_per_edge": 5, "velocity": [10.0, -8.0, 6.0]}
+    room = {"type": "box", "size": [4.0, 4.0, 4.0], "stiffness": 2000.0, "damping": 0.0}
+    scene = make_scene(bodies=[body], materials={"jelly": material}, colliders=[room], solver={"dt": "auto"})
+    simulator = Simulator(scene, device="cpu")
+
+    def total() -> float:
+        now = simulator.diagnostics()
+        return now["kinetic"] + now["elastic"] + now["contact"]
+
+    first = total()
+    simulator.step(5000)
+    # As above.
+    assert total() <= 3 * first
+
+
+def test_a_run_above_the_limit_warns_with_both_numbers(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Warn just above the limit, with the step and the limit; say nothing just below it."""
+    limit = limits_of(make_cube(3, ALL_LIMITED))["semi_implicit_euler"]
+    assert limit is not None
+    for share, warned in ((0.99, False), (1.01, True)):
+        caplog.clear()
+        dt = share * limit
+        with caplog.at_level(logging.WARNING):
+            simulate(make_cube(3, ALL_LIMITED, solver={"dt": dt}, fps=1 / dt), output=tmp_path / str(share))
+        said = [record.getMessage() for record in caplog.records]
+        assert bool(said) == warned
+        if warned:
+            assert f"{dt:.4g} s" in said[0]
+            assert f"{limit:.4g} s" in said[0]
+
+
+def test_a_diverged_run_names_the_limit_that_was_broken() -> None:
+    """Give both numbers when asked for the limits before, and the step alone when it is within them."""
+    simulator = Simulator(make_cube(3, ALL_LIMITED, solver={"dt": 0.01}), device="cpu")
+    limit = simulator.step_limits(contacts=False)["semi_implicit_euler"]
+    rng = np.random.default_rng(1)
+    set_state(simulator, x=simulator.positions + 0.01 * rng.standard_normal((27, 3)))
+    with pytest.raises(DivergedError, match=f"0.01 s is above the largest stable one of the springs, {limit:.4g} s"):
+        for _ in range(1000):
+            simulator.advance_frame()
+
+
+def test_limits_belong_to_the_start() -> None:
+    """Refuse to look for limits in a shape that is not at rest."""
+    simulator = Simulator(make_cube(2, ALL_LIMITED), device="cpu")
+    simulator.step()
+    with pytest.raises(RuntimeError, match="before the first step"):
+        simulator.step_limits(contacts=False)
+
+
+def test_check_gives_all_limits() -> None:
+    """List seconds or null for each integrator, as JSON can hold them."""
+    figures = forecast(make_cube(3, UNDAMPED), device="cpu")
+    limits = json.loads(json.dumps(figures, allow_nan=False))["dt_limit"]
+    assert set(limits) == set(INTEGRATORS)
+    assert limits["explicit_euler"] is None
+    assert limits["rk2"] is None
+    top = World(make_cube(3, UNDAMPED)).top_frequency()
+    # Of an oscillator, 2 / w and 8^0.5 / w; half of Lanczos's 1 %.
+    assert limits["semi_implicit_euler"] == pytest.approx(2 / top, rel=0.005)
+    assert limits["rk4"] == pytest.approx(math.sqrt(8) / top, rel=0.005)

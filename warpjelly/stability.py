@@ -1,0 +1,248 @@
+"""The largest stable time step of a scene, from its springs linearised about rest.
+
+With A = M^-1/2 K M^-1/2 [1/s^2] and B = M^-1/2 D M^-1/2 [1/s], stiffness K and damping D of the springs at rest, small
+motions obey y'' = -A y - B y'. For an eigenvector y of the motion or of a scheme's step, a = y*A y and d = y*B y turn
+this into the scalar y'' = -a y - d y'. So a step is stable when it is stable for each pair (a, d) that unit vectors y
+give. These pairs fill a convex set, whose reach in a direction (p, q) is the top eigenvalue of p A + q B; here it is
+known as a polygon around it. Where damping / stiffness is the same for all springs, the set is a line and the limit
+is exact; otherwise it is a bound. ARCHITECTURE.md has the formulas and what was measured.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+import warp as wp
+
+from warpjelly.kernels import springs
+
+from .model import Model
+
+INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
+# Share of the limit that dt = "auto" takes. Away from rest springs turn and stretch, and the limit is lower: undamped
+# semi-implicit Euler was seen to blow up at 0.7 of it under 30 % strain. Runge-Kutta 4 takes energy out of the fastest
+# motions, which leaves it more room.
+SAFETY = {"explicit_euler": 0.5, "semi_implicit_euler": 0.5, "rk2": 0.5, "rk4": 0.8}
+# No limit above this is reported, s; no scene may ask for a longer step.
+MAX_STEP = 1.0
+# Steps of the Lanczos iteration: within 1 % of the top eigenvalue of lattices up to 64^3.
+LANCZOS_STEPS = 30
+# Directions around the circle in which the set of pairs is measured. Their polygon is 1 % too large at most.
+DIRECTIONS = 24
+# Points on each edge of the set in which a Runge-Kutta step is tested.
+EDGE_POINTS = 256
+
+
+def step_limits(pairs: np.ndarray) -> dict[str, float | None]:
+    """Return the largest stable step of each integrator, s; None where no step is stable.
+
+    Args:
+        pairs: vertices of the set of (a, d), as from ``measure_pairs`` or ``add_contacts``, [vertex_count, 2].
+    """
+    a, d = pairs.T
+    # The conditions of both Euler schemes are linear in (a, d): the vertices decide.
+    semi_implicit = _quotient(4.0, d + np.sqrt(d * d + 4.0 * a))
+    root = d * d - 4.0 * a
+    explicit = np.where(root > 0.0, _quotient(4.0, d + np.sqrt(np.maximum(root, 0.0))), _quotient(d, a))
+    steps = {"explicit_euler": explicit.min(), "semi_implicit_euler": semi_implicit.min()}
+    # The stable set of the others is star-shaped and without holes: the edges decide.
+    share = np.linspace(0.0, 1.0, EDGE_POINTS)[:, None, None]
+    edges = ((1.0 - share) * pairs + share * np.roll(pairs, -1, axis=0)).reshape(-1, 2)
+    # On the imaginary axis |R|^2 = 1 + |z|^4 / 4 for RK2.
+    undamped = (edges[:, 0] > 0.0) & (edges[:, 1] <= 0.0)
+    steps["rk2"] = 0.0 if undamped.any() else _runge_kutta_limit(edges, (1.0, 0.5))
+    steps["rk4"] = _runge_kutta_limit(edges, (1.0, 0.5, 1.0 / 6.0, 1.0 / 24.0))
+    return {name: min(float(steps[name]), MAX_STEP) if steps[name] > 0.0 else None for name in INTEGRATORS}
+
+
+def _quotient(numerator: np.ndarray | float, denominator: np.ndarray) -> np.ndarray:
+    """Divide, with infinity over zero: what is not moved by any force has no limit."""
+    infinite = np.full(np.shape(denominator), np.inf)
+    return np.divide(numerator, denominator, out=infinite, where=denominator > 0.0)
+
+
+def _runge_kutta_limit(edges: np.ndarray, coefficients: tuple[float, ...]) -> float:
+    """Return the largest dt with |R(dt mu)| <= 1 for both roots of mu^2 + d mu + a = 0 of each pair (a, d).
+
+    Args:
+        edges: pairs, [count, 2].
+        coefficients: of R(z) - 1 = c1 z + c2 z^2 + ...
+    """
+    a, d = edges.T
+    root = np.sqrt((d * d / 4.0 - a).astype(complex))
+    mu = np.concatenate([-d / 2.0 - root, -d / 2.0 + root])
+    mu = mu[np.abs(mu) > 0.0]
+    if len(mu) == 0:
+        return math.inf
+    # No stable z is as far from the origin as 4.
+    low, high = np.zeros(len(mu)), 4.0 / np.abs(mu)
+    for _ in range(50):
+        middle = (low + high) / 2.0
+        z = middle * mu
+        change = np.zeros_like(z)
+        for coefficient in reversed(coefficients):
+            change = (change + coefficient) * z
+        # |1 + c|^2 - 1, without the rounding errors of a difference from 1.
+        stable = 2.0 * change.real + np.abs(change) ** 2 <= 0.0
+        low, high = np.where(stable, middle, low), np.where(stable, high, middle)
+    return float(low.min())
+
+
+def measure_pairs(model: Model, x: wp.array) -> np.ndarray:
+    """Return a convex polygon around the pairs (a, d) of the springs, [vertex_count, 2], 1/s^2 and 1/s.
+
+    Args:
+        model: the springs and masses.
+        x: positions at rest, real [3, particle_count], m.
+    """
+    ratios = _ratios(model)
+    if len(ratios) == 0:
+        return np.zeros((1, 2))
+    least, greatest = ratios.min(), ratios.max()
+    top_eigenvalue = _eigenvalue_solver(model, x)
+    if math.isinf(least):
+        return np.array([[0.0, 0.0], [0.0, top_eigenvalue(0.0, 1.0)]])
+    if _are_equal(ratios):
+        top = top_eigenvalue(1.0, 0.0)
+        return np.array([[0.0, 0.0], [top, greatest * top]])
+    scale = np.array([top_eigenvalue(1.0, 0.0), top_eigenvalue(0.0, 1.0)])
+    polygon = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    # Pairs are sums over springs, so d / a is between the least and the greatest quotient.
+    polygon = _clip(polygon, np.array([least * scale[0], -scale[1]]), 0.0)
+    if math.isfinite(greatest):
+        polygon = _clip(polygon, np.array([-greatest * scale[0], scale[1]]), 0.0)
+    for number in range(DIRECTIONS):
+        # The square has the directions of the axes, and the origin those between -90 and -180 degrees.
+        angle = -math.pi / 2.0 + 2.0 * math.pi * number / DIRECTIONS
+        if angle < math.pi and number % (DIRECTIONS // 4):
+            normal = np.array([math.cos(angle), math.sin(angle)])
+            # Where the body moves freely, the origin is in the set.
+            polygon = _clip(polygon, normal, max(0.0, top_eigenvalue(*(normal / scale))))
+    return polygon * scale
+
+
+def evaluations(model: Model) -> int:
+    """Return how many evaluations of the spring forces take about as long as ``measure_pairs``, vectors included."""
+    return 60 if _are_equal(_ratios(model)) else 1200
+
+
+def _ratios(model: Model) -> np.ndarray:
+    """Return damping / stiffness of each class of springs that does anything, [count], s."""
+    used = np.unique(model.spans.numpy()[:, 3])
+    k, d = model.spring_classes.numpy().astype(float)[used, 1:].T
+    acting = (k > 0.0) | (d > 0.0)
+    return _quotient(d[acting], k[acting])
+
+
+def _are_equal(ratios: np.ndarray) -> bool:
+    # In float32 equal quotients differ by rounding.
+    return len(ratios) == 0 or bool(ratios.max() <= ratios.min() * (1.0 + 1e-6))
+
+
+def add_contacts(pairs: np.ndarray, model: Model) -> np.ndarray:
+    """Return a polygon around the pairs (a, d) of springs and of contact with any one collider.
+
+    Each particle may touch, so this is a safe bound: the stiffness and the damping of a collider over the least mass
+    are added. Two colliders that one particle touches in one direction at once would add up; that is not covered.
+    """
+    collider_count = len(model.colliders.kind)
+    if collider_count == 0:
+        return pairs
+    added = np.stack([model.colliders.stiffness.numpy(), model.colliders.damping.numpy()], axis=1).astype(float)
+    added *= float(model.particle_inv_mass.numpy().max())
+    return _hull(np.concatenate([pairs, *(pairs + pair for pair in added)]))
+
+
+def _clip(polygon: np.ndarray, normal: np.ndarray, reach: float) -> np.ndarray:
+    """Return the part of a convex polygon, [vertex_count, 2], where normal . p <= reach."""
+    height = polygon @ normal - reach
+    kept = []
+    for p, h, q, g in zip(polygon, height, np.roll(polygon, -1, axis=0), np.roll(height, -1), strict=True):
+        if h <= 0.0:
+            kept.append(p)
+        if h * g < 0.0:
+            kept.append(p + (q - p) * h / (h - g))
+    return np.array(kept)
+
+
+def _hull(points: np.ndarray) -> np.ndarray:
+    """Return the convex hull of points, [count, 2], counterclockwise (Andrew's monotone chain)."""
+    ordered = sorted({(float(a), float(d)) for a, d in points})
+    if len(ordered) < 3:
+        return np.array(ordered)
+    chains: list[list[tuple[float, float]]] = []
+    for sequence in (ordered, ordered[::-1]):
+        chain: list[tuple[float, float]] = []
+        for p in sequence:
+            while len(chain) > 1 and (
+                (chain[-1][0] - chain[-2][0]) * (p[1] - chain[-2][1])
+                - (chain[-1][1] - chain[-2][1]) * (p[0] - chain[-2][0])
+                <= 0.0
+            ):
+                chain.pop()
+            chain.append(p)
+        chains.append(chain[:-1])
+    return np.array(chains[0] + chains[1])
+
+
+def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], float]:
+    """Return a function (p, q) -> top eigenvalue of p A + q B.
+
+    The force kernel itself applies the matrices: at rest, with velocities w and (rest length, 0, p k + q d) for (rest
+    length, stiffness, damping), it gives -(p K + q D) w.
+    """
+    device = x.device
+    v, f = wp.zeros_like(x), wp.zeros_like(x)
+    classes = model.spring_classes.numpy().astype(float)
+    root = np.sqrt(model.particle_inv_mass.numpy().astype(float))
+    start = np.random.default_rng(0).standard_normal(x.shape) * (root > 0.0)
+
+    def top_eigenvalue(p: float, q: float) -> float:
+        constants = np.stack([classes[:, 0], 0.0 * classes[:, 0], p * classes[:, 1] + q * classes[:, 2]], axis=1)
+        table = wp.array(constants, dtype=model.spring_classes.dtype, device=device)
+
+        def multiply(vector: np.ndarray) -> np.ndarray:
+            v.assign((root * vector).astype(wp.dtype_to_numpy(model.real)))
+            f.zero_()
+            inputs = [model.spans, table, x, v]
+            if device.is_cpu:
+                wp.launch(springs.add_span_forces, len(model.spans), inputs=inputs, outputs=[f], device=device)
+            else:
+                lanes = (len(model.spans), springs.MAX_SPAN)
+                wp.launch(springs.add_spring_forces, lanes, inputs=inputs, outputs=[f], device=device)
+            return -root * f.numpy()
+
+        return _lanczos(multiply, start)
+
+    return top_eigenvalue
+
+
+def _lanczos(multiply: Callable[[np.ndarray], np.ndarray], start: np.ndarray) -> float:
+    """Return the top eigenvalue of a symmetric matrix, from below.
+
+    Without reorthogonalisation three vectors are enough: what orthogonality is lost is lost towards eigenvectors that
+    have been found, which repeats their eigenvalues and leaves the top one as it is (Paige 1980,
+    doi:10.1016/0024-3795(80)90167-6).
+    """
+    if not (norm := float(np.linalg.norm(start))):
+        return 0.0
+    before, now, off = np.zeros_like(start), start / norm, 0.0
+    diagonal: list[float] = []
+    beside: list[float] = []
+    for _ in range(min(LANCZOS_STEPS, int(np.count_nonzero(start)))):
+        ahead = multiply(now)
+        diagonal.append(float(np.vdot(now, ahead)))
+        ahead -= diagonal[-1] * now
+        ahead -= off * before
+        off = float(np.linalg.norm(ahead))
+        # What is left is rounding when the start had no more eigenvectors in it.
+        if off <= 1e-6 * max(map(abs, diagonal)):
+            break
+        beside.append(off)
+        ahead /= off
+        before, now = now, ahead
+    size = len(diagonal)
+    tridiagonal = np.diag(diagonal) + np.diag(beside[: size - 1], 1) + np.diag(beside[: size - 1], -1)
+    return float(np.linalg.eigvalsh(tridiagonal)[-1])
