@@ -82,7 +82,7 @@ def test_defaults_are_filled_in(scene_file):
         ({"bodies": []}, ["bodies = []", "at least 1"]),
         ({"materials.jelly.particle_mass": 0.0}, ["materials.jelly.particle_mass = 0.0", "greater than 0", "kg"]),
         ({"materials.jelly.shear.stiffness": -5.0}, ["materials.jelly.shear.stiffness = -5.0", "N/m"]),
-        ({"materials.jelly.law": "rubber"}, ['materials.jelly.law = "rubber"', "'strain' or 'hooke'"]),
+        ({"materials.jelly.law": "rubber"}, ['materials.jelly.law = "rubber"', "'strain', 'hooke' or 'young'"]),
         ({"gravity": [0.0, math.nan, 0.0]}, ["gravity.1", "finite"]),
         ({"fps": 0.0}, ["fps = 0.0", "samples per second"]),
         ({"duration": 1e9}, ["duration = 1000000000.0", "frames"]),

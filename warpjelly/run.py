@@ -88,7 +88,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
     scene, total = sim.scene, sim.scene.frame_count
     rest = sim.surfaces()
     meshes = [
-        SurfaceMesh(body.name, surface.points, surface.normals, body.quads)
+        SurfaceMesh(body.name, surface.points, surface.normals, body.quads, body.double_sided)
         for body, surface in zip(sim.model.bodies, rest, strict=True)
     ]
     _warn_of_deep_starts(sim)
