@@ -198,34 +198,41 @@ def _connect(
 ) -> tuple[np.ndarray, np.ndarray, SpringClasses]:
     """Return the springs, int32 [spring_count, 2], kind by kind; the class of each, int [spring_count]; the classes."""
     springs: list[list[np.ndarray]] = [[], [], [], []]
-    cells: list[list[np.ndarray]] = [[], [], [], []]
-    bends: list[np.ndarray] = []
+    labels: list[list[np.ndarray]] = [[], [], [], []]
     for direction in DIRECTIONS:
         kind = int(np.abs(direction).sum()) - 1
         found, counts = _springs_along(direction, units.shape, corner_particles, weighted)
         springs[kind].append(found)
-        cells[kind].append(counts)
+        labels[kind].append(_label(kind, counts))
         if kind == STRUCTURAL:
             under = _bend_springs(found, particle_count)
             springs[BEND].append(np.stack([found[under[:, 0], 0], found[under[:, 1], 1]], axis=1))
             if weighted:
-                cells[BEND].append(counts[under].min(axis=1))
-                over = sum(np.bincount(under[:, end], cells[BEND][-1], minlength=len(found)) for end in (0, 1))
-                bends.append(np.asarray(over, np.uint8))
-    by_kind = [np.concatenate(parts) for parts in springs]
-    kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in by_kind])
-    ends = np.concatenate(by_kind)
+                fewer = counts[under].min(axis=1)
+                labels[BEND].append(_label(BEND, fewer))
+                for end in (0, 1):
+                    over = np.bincount(under[:, end], fewer, minlength=len(found))
+                    labels[kind][-1] += over.astype(np.uint16)
+    ends = np.concatenate([part for parts in springs for part in parts])
     if not weighted:
+        kinds = np.repeat(np.arange(4, dtype=np.uint8), [sum(map(len, parts)) for parts in springs])
         return ends, kinds, SpringClasses(np.arange(4), REST_LENGTHS * unit)
-    # At most 4 cells around an edge and 4 bend springs over it: three small numbers in one, and no sorting.
-    count = np.concatenate([part for parts in cells for part in parts]).astype(np.uint16)
-    label = kinds.astype(np.uint16) << 8 | count << 5
-    label[kinds == STRUCTURAL] |= np.concatenate(bends)
-    used = np.bincount(label, minlength=1 << 10) > 0
-    labels = np.flatnonzero(used)
+    parts = [part for parts in labels for part in parts]
+    used = np.zeros(1 << 10, bool)
+    for part in parts:
+        used |= np.bincount(part, minlength=len(used)) > 0
     row = (np.cumsum(used) - 1).astype(np.uint8)
-    classes = SpringClasses(labels >> 8, REST_LENGTHS[labels >> 8] * unit, labels >> 5 & 7, labels & 31)
-    return ends, row[label], classes
+    label = np.flatnonzero(used)
+    classes = SpringClasses(label >> 8, REST_LENGTHS[label >> 8] * unit, label >> 5 & 7, label & 31)
+    return ends, np.concatenate([row[part] for part in parts]), classes
+
+
+def _label(kind: int, cells: np.ndarray) -> np.ndarray:
+    """Return one number for the kind and the cells of springs, uint16; its last 5 bits are left for the bend springs.
+
+    At most 4 cells contain a spring, and at most 4 bend springs, each with at most 4 cells, run over a structural one.
+    """
+    return np.uint16(kind << 8) | cells.astype(np.uint16) << np.uint16(5)
 
 
 def _springs_along(

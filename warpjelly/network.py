@@ -69,7 +69,7 @@ def build_cloth(size: tuple[float, float], particles: tuple[int, int]) -> Lattic
     return Lattice(
         particles=np.stack([*np.meshgrid(x, [0.0], z, indexing="ij")], axis=-1).reshape(-1, 3),
         springs=np.concatenate([np.stack([first.ravel(), second.ravel()], axis=1) for _, _, first, second in families]),
-        spring_classes=np.repeat(np.arange(len(families)), [first.size for _, _, first, _ in families]),
+        spring_classes=np.repeat(np.arange(len(families), dtype=np.uint8), [first.size for _, _, first, _ in families]),
         classes=SpringClasses(np.array([kind for kind, *_ in families]), np.array([rest for _, rest, *_ in families])),
         cell_counts=np.zeros(number.size, np.int32),
         unit=min(along_x, along_z),
