@@ -302,6 +302,7 @@ def add_contact_forces(
     low = vectors.load(lower, chunk)
     high = vectors.load(upper, chunk)
     now = step[0]
+    at_start = now == wp.int64(0)
     near = wp.uint32(0)
     for c in range(colliders.kind.shape[0]):
         if not culling or may_touch(colliders, c, body, low, high):
@@ -319,7 +320,7 @@ def add_contact_forces(
             if near & collider_bit(c) != wp.uint32(0):
                 held = held_contact(colliders, c, stamps, i, now)
                 before = held_normal(colliders, c, normals, i)
-                normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, now == wp.int64(0))
+                normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, at_start)
                 if depth >= type(dt)(0.0):
                     touches = True
                     if first:

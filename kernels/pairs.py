@@ -32,9 +32,7 @@ def gather_skin(
 
 
 @wp.func
-def pair_force(
-    offset: Any, velocity: Any, reach: Any, stiffness: Any, damping: Any, friction: Any, mass: Any, dt: Any
-):
+def pair_force(offset: Any, velocity: Any, reach: Any, stiffness: Any, damping: Any, friction: Any, mass: Any, dt: Any):
     """Return what a particle feels of another one within reach, as (force, overlap).
 
     Args:
@@ -90,7 +88,9 @@ def may_collide(
     if skin_body[a] == skin_body[b]:
         collide = with_itself
         if collide:
-            collide = wp.length(skin_rest[a] - skin_rest[b]) >= reach and not are_joined(neighbor_start, neighbors, a, b)
+            collide = wp.length(skin_rest[a] - skin_rest[b]) >= reach and not are_joined(
+                neighbor_start, neighbors, a, b
+            )
     return collide
 
 
@@ -120,8 +120,8 @@ def add_pair_forces(
 ):
     """Add the forces on each particle of the skin, one thread each.
 
-    ``response`` [1] is stiffness [N/m], damping [N s/m] and friction. Losses [2, point_count] gain each particle's half of
-    the power of damping and of friction times loss_weight.
+    ``response`` [1] is stiffness [N/m], damping [N s/m] and friction. Losses [2, point_count] gain each particle's half
+    of the power of damping and of friction times loss_weight.
     """
     a = wp.tid()
     i = skin[a]
@@ -131,8 +131,9 @@ def add_pair_forces(
     rubbed = wp.float64(0.0)
     half = wp.float64(0.5) * wp.float64(loss_weight)
     c = response[0]
-    query = wp.hash_grid_query(grid, point, (skin_radius[a] + greatest_radius) * type(dt)(1.0 + SEARCH_MARGIN))
-    b = int(0)
+    search = (skin_radius[a] + greatest_radius) * type(dt)(1.0 + SEARCH_MARGIN)
+    query = wp.hash_grid_query(grid, point, search)
+    b = wp.int32(0)
     while wp.hash_grid_query_next(query, b):
         if b != a:
             offset = point - points[b]
@@ -177,8 +178,10 @@ def measure_pairs(
     a = wp.tid()
     point = points[a]
     stored = wp.float64(0.0)
-    query = wp.hash_grid_query(grid, point, (skin_radius[a] + greatest_radius) * type(greatest_radius)(1.0 + SEARCH_MARGIN))
-    b = int(0)
+    query = wp.hash_grid_query(
+        grid, point, (skin_radius[a] + greatest_radius) * type(greatest_radius)(1.0 + SEARCH_MARGIN)
+    )
+    b = wp.int32(0)
     while wp.hash_grid_query_next(query, b):
         if b != a:
             reach = skin_radius[a] + skin_radius[b]

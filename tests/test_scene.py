@@ -82,7 +82,7 @@ def test_defaults_are_filled_in(scene_file):
         ({"bodies": []}, ["bodies = []", "at least 1"]),
         ({"materials.jelly.particle_mass": 0.0}, ["materials.jelly.particle_mass = 0.0", "greater than", "kg"]),
         ({"materials.jelly.shear.stiffness": -5.0}, ["materials.jelly.shear.stiffness = -5.0", "N/m"]),
-        ({"materials.jelly.law": "rubber"}, ['materials.jelly.law = "rubber"', "'strain' or 'hooke'"]),
+        ({"materials.jelly.law": "rubber"}, ['materials.jelly.law = "rubber"', "'strain', 'hooke' or 'young'"]),
         ({"gravity": [0.0, math.nan, 0.0]}, ["gravity.1", "finite"]),
         ({"fps": 0.0}, ["fps = 0.0", "samples per second"]),
         ({"duration": 1e9}, ["duration = 1000000000.0", "frames"]),
@@ -232,3 +232,74 @@ def test_the_resolved_scene_reads_back(scene_file):
 def test_the_schema_for_editors_is_current():
     """Compare scenes/schema.json with the models; `python -m warpjelly.scene > scenes/schema.json` renews it."""
     assert json.loads((SCENES / "schema.json").read_text()) == Scene.model_json_schema()
+
+
+NETWORK = {
+    "type": "network",
+    "material": "jelly",
+    "points": [[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [2.0, 0.0, 0.0], [2.0, 0.0, 0.0]],
+}
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"structural": [[0, 1], [1, 1]]}, ["structural.1 = [1, 1]", "two different particles"]),
+        ({"shear": [[0, 4]]}, ["shear.0 = [0, 4]", "no particle 4", "0 to 3"]),
+        ({"bend": [[0, -1]]}, ["bend.0.1 = -1", "greater than or equal to 0"]),
+        ({"structural": [[0, 1], [1, 2]], "bend": [[2, 1]]}, ["bend.0 = [2, 1]", "by structural.1 already"]),
+        ({"structural": [[2, 3]]}, ["structural.0 = [2, 3]", "rest length must be at least 1e-06 m"]),
+        ({"structural": [[2, 3]], "rest_lengths": [0.0]}, ["rest_lengths.0 = 0.0", "m, one for each spring"]),
+        (
+            {"structural": [[0, 1]], "rest_lengths": [1.0, 2.0]},
+            ["rest_lengths = [1.0, 2.0]", "2 of them for 1 springs"],
+        ),
+        ({"structural": [[0]]}, ["structural.0.1", "missing"]),
+        ({"points": []}, ["points = []", "at least 1 item"]),
+        ({"pinned": [{}]}, ["pinned.0", "give indices, or lower and upper"]),
+        ({"pinned": [{"indices": [0], "lower": [0, 0, 0]}]}, ["pinned.0", "give indices, or lower and upper"]),
+        ({"pinned": [{"lower": [0, 0, 0]}]}, ["pinned.0", "give indices, or lower and upper"]),
+        ({"pinned": [{"lower": [0, 2, 0], "upper": [1, 1, 1]}]}, ["pinned.0.lower", "must not be above upper"]),
+        ({"pinned": [{"indices": []}]}, ["pinned.0.indices = []", "at least 1 item"]),
+        ({"type": "cloth", "points": None}, ["bodies.0.points", "unknown key"]),
+    ],
+)
+def test_a_bad_network_is_refused_in_one_line(scene_file, changes, said):
+    """Require the key, the value and what is allowed for springs and pins that cannot be."""
+    message = refusal(scene_file(), overrides={"bodies": [{**NETWORK, **changes}]})
+    assert "bodies.0." in message
+    for part in said:
+        assert part in message
+
+
+@pytest.mark.parametrize(
+    ("material", "said"),
+    [
+        ({"law": "young", "density": 1e3}, ["materials.jelly.youngs_modulus", "missing", "law young"]),
+        ({"law": "young", "youngs_modulus": 1e4}, ["materials.jelly.density", "missing", "law young"]),
+        (
+            {"law": "young", "youngs_modulus": 1e4, "density": 1e3, "bend": {}},
+            ["jelly.bend", "does not go with law young"],
+        ),
+        (
+            {"law": "young", "youngs_modulus": 1e4, "density": 1e3, "particle_mass": 1.0},
+            ["materials.jelly", "particle_mass or density"],
+        ),
+        ({"youngs_modulus": 1e4}, ["jelly.youngs_modulus", "does not go with law strain", "structural, shear, bend"]),
+        ({"law": "hooke", "damping_time": 0.1}, ["jelly.damping_time", "does not go with law hooke"]),
+        ({"law": "young", "youngs_modulus": 0.0, "density": 1e3}, ["youngs_modulus = 0.0", "greater than 0", "Pa"]),
+    ],
+)
+def test_keys_of_a_material_go_with_its_law(scene_file, material, said):
+    """Refuse what a law does not take and ask for what it requires."""
+    message = refusal(scene_file(), overrides={"materials.jelly": material})
+    for part in said:
+        assert part in message
+
+
+@pytest.mark.parametrize("body", [NETWORK, {"type": "cloth", "material": "jelly"}])
+@pytest.mark.parametrize("material", [{"density": 1e3}, {"law": "young", "youngs_modulus": 1e4, "density": 1e3}])
+def test_bodies_without_volume_take_no_density(scene_file, body, material):
+    """Refuse a density, and with it Young's law, for a network and a cloth."""
+    message = refusal(scene_file(), overrides={"materials.jelly": material, "bodies": [body]})
+    assert "bodies.0.material" in message and "has no volume" in message and "particle_mass" in message

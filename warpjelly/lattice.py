@@ -28,28 +28,52 @@ CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
 
 @dataclass(frozen=True)
+class SpringClasses:
+    """What the springs of a body have in common, whatever its material: a row for each distinct combination."""
+
+    kinds: np.ndarray
+    """STRUCTURAL, FACE_SHEAR, BODY_SHEAR or BEND, int [class_count]."""
+    rest_lengths: np.ndarray
+    """float64 [class_count], m."""
+    cells: np.ndarray | None = None
+    """How many occupied unit cells contain the spring, int [class_count]; of a bend spring, the fewer of those of the
+    two structural springs under it. None where it was not asked for."""
+    bends: np.ndarray | None = None
+    """Sum of ``cells`` of the bend springs over a structural spring, int [class_count]."""
+
+
+@dataclass(frozen=True)
 class Lattice:
-    """One body at rest, in the frame of its grid."""
+    """One body at rest, in its own frame; a network or a cloth has no cells, and 0 where they are counted."""
 
     particles: np.ndarray
     """Rest positions, float64 [particle_count, 3], m."""
     springs: np.ndarray
-    """Both ends, int32 [spring_count, 2], class by class."""
-    spring_kinds: np.ndarray
-    """STRUCTURAL, FACE_SHEAR, BODY_SHEAR or BEND, uint8 [spring_count]."""
+    """Both ends, int32 [spring_count, 2], kind by kind."""
+    spring_classes: np.ndarray
+    """Row of each spring in ``classes``, int [spring_count]."""
+    classes: SpringClasses
     cell_counts: np.ndarray
     """How many occupied unit cells share each particle, 1 to 8, int32 [particle_count]."""
     unit: float
-    """Edge of a unit cell, m."""
-    voxel_count: int
-    """Number of jelly cubes."""
+    """Edge of a unit cell, m; without cells, the shortest rest length."""
     surface_particles: np.ndarray
-    """Particles on the surface, ascending, int32 [point_count]."""
+    """Particle of each point that is shown, int32 [point_count]: those on the surface, ascending; or, where there are
+    no faces, both ends of each spring, one after another."""
     surface_quads: np.ndarray
     """Outward faces, counter-clockwise from outside, indices into surface_particles, int32 [face_count, 4]."""
+    double_sided: bool = False
+    """Whether the faces are seen from both sides."""
+
+    @property
+    def spring_kinds(self) -> np.ndarray:
+        """STRUCTURAL, FACE_SHEAR, BODY_SHEAR or BEND, int [spring_count]."""
+        return self.classes.kinds[self.spring_classes]
 
 
-def build_lattice(cells: np.ndarray, *, origin: np.ndarray, cell_size: float, particles_per_edge: int = 2) -> Lattice:
+def build_lattice(
+    cells: np.ndarray, *, origin: np.ndarray, cell_size: float, particles_per_edge: int = 2, weighted: bool = False
+) -> Lattice:
     """Join the occupied cells of a grid into one lattice.
 
     Args:
@@ -57,6 +81,7 @@ def build_lattice(cells: np.ndarray, *, origin: np.ndarray, cell_size: float, pa
         origin: lowest corner of the grid, [3], m.
         cell_size: edge of a jelly cube, m.
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
+        weighted: tell springs apart by how many cells contain them, too; otherwise there are four classes, the kinds.
     """
     refinement = particles_per_edge - 1
     units = cells
@@ -64,15 +89,15 @@ def build_lattice(cells: np.ndarray, *, origin: np.ndarray, cell_size: float, pa
         units = np.repeat(units, refinement, axis=axis)
     unit = cell_size / refinement
     corner_particles, particles, cell_counts = _share_corners(units)
-    springs, kinds = _connect(units, corner_particles, len(particles))
+    springs, spring_classes, classes = _connect(units, corner_particles, len(particles), unit, weighted)
     surface_particles, surface_quads = _skin(units, corner_particles, len(particles))
     return Lattice(
         particles=np.asarray(origin, float) + unit * particles,
         springs=springs,
-        spring_kinds=kinds,
+        spring_classes=spring_classes,
+        classes=classes,
         cell_counts=cell_counts,
         unit=unit,
-        voxel_count=int(np.count_nonzero(cells)),
         surface_particles=surface_particles,
         surface_quads=surface_quads,
     )
@@ -171,24 +196,55 @@ def _share_corners(units: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     return corner_particles, particles, cell_counts
 
 
-def _connect(units: np.ndarray, corner_particles: np.ndarray, particle_count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the springs, int32 [spring_count, 2], and their kinds, uint8 [spring_count]."""
+def _connect(
+    units: np.ndarray, corner_particles: np.ndarray, particle_count: int, unit: float, weighted: bool
+) -> tuple[np.ndarray, np.ndarray, SpringClasses]:
+    """Return the springs, int32 [spring_count, 2], kind by kind; the class of each, int [spring_count]; the classes."""
     springs: list[list[np.ndarray]] = [[], [], [], []]
+    labels: list[list[np.ndarray]] = [[], [], [], []]
     for direction in DIRECTIONS:
         kind = int(np.abs(direction).sum()) - 1
-        found = _springs_along(direction, units.shape, corner_particles)
+        found, counts = _springs_along(direction, units.shape, corner_particles, weighted)
         springs[kind].append(found)
+        labels[kind].append(_label(kind, counts))
         if kind == STRUCTURAL:
-            springs[BEND].append(_bend_springs(found, particle_count))
-    by_kind = [np.concatenate(parts) for parts in springs]
-    kinds = np.repeat(np.arange(4, dtype=np.uint8), [len(part) for part in by_kind])
-    return np.concatenate(by_kind), kinds
+            under = _bend_springs(found, particle_count)
+            springs[BEND].append(np.stack([found[under[:, 0], 0], found[under[:, 1], 1]], axis=1))
+            if weighted:
+                fewer = counts[under].min(axis=1)
+                labels[BEND].append(_label(BEND, fewer))
+                for end in (0, 1):
+                    over = np.bincount(under[:, end], fewer, minlength=len(found))
+                    labels[kind][-1] += over.astype(np.uint16)
+    ends = np.concatenate([part for parts in springs for part in parts])
+    if not weighted:
+        kinds = np.repeat(np.arange(4, dtype=np.uint8), [sum(map(len, parts)) for parts in springs])
+        return ends, kinds, SpringClasses(np.arange(4), REST_LENGTHS * unit)
+    parts = [part for parts in labels for part in parts]
+    used = np.zeros(1 << 10, bool)
+    for part in parts:
+        used |= np.bincount(part, minlength=len(used)) > 0
+    row = (np.cumsum(used) - 1).astype(np.uint8)
+    label = np.flatnonzero(used)
+    classes = SpringClasses(label >> 8, REST_LENGTHS[label >> 8] * unit, label >> 5 & 7, label & 31)
+    return ends, np.concatenate([row[part] for part in parts]), classes
 
 
-def _springs_along(direction: tuple[int, int, int], shape: tuple[int, ...], corner_particles: np.ndarray) -> np.ndarray:
+def _label(kind: int, cells: np.ndarray) -> np.ndarray:
+    """Return one number for the kind and the cells of springs, uint16; its last 5 bits are left for the bend springs.
+
+    At most 4 cells contain a spring, and at most 4 bend springs, each with at most 4 cells, run over a structural one.
+    """
+    return np.uint16(kind << 8) | cells.astype(np.uint16) << np.uint16(5)
+
+
+def _springs_along(
+    direction: tuple[int, int, int], shape: tuple[int, ...], corner_particles: np.ndarray, counted: bool
+) -> tuple[np.ndarray, np.ndarray]:
     """Return the springs in one direction, int32 [count, 2], in scan order of the vertices they start from.
 
-    Up to four cells hold a spring's place, and each names its own pair of particles: mostly the same one.
+    Up to four cells hold a spring's place, and each names its own pair of particles: mostly the same one. The second
+    array says how many cells do, uint8 [count]; it is empty unless ``counted``.
     """
     nx, ny, nz = shape
     candidates: list[tuple[Any, np.ndarray, np.ndarray]] = []
@@ -198,37 +254,46 @@ def _springs_along(direction: tuple[int, int, int], shape: tuple[int, ...], corn
             at = tuple(slice(c, c + n) for c, n in zip(corner, shape, strict=True))
             candidates.append((at, corner_particles[number], corner_particles[CORNERS.index(target)]))
     pairs = np.full((nx + 1, ny + 1, nz + 1, len(candidates), 2), -1, np.int32)
+    counts = np.ones(pairs.shape[:-1] if counted else 0, np.uint8)
     for slot, (at, start, end) in enumerate(candidates):
         repeated = np.zeros(shape, bool)
         for earlier in range(slot):
-            repeated |= (pairs[(*at, earlier, 0)] == start) & (pairs[(*at, earlier, 1)] == end)
+            same = (pairs[(*at, earlier, 0)] == start) & (pairs[(*at, earlier, 1)] == end)
+            repeated |= same
+            if counted:
+                counts[(*at, earlier)] += same
         pairs[(*at, slot, 0)] = np.where(repeated, -1, start)
         pairs[(*at, slot, 1)] = np.where(repeated, -1, end)
     flat = pairs.reshape(-1, 2)
-    return flat[flat[:, 0] >= 0]
+    found = flat[:, 0] >= 0
+    return flat[found], counts.reshape(-1)[found] if counted else counts
 
 
 def _bend_springs(structural: np.ndarray, particle_count: int) -> np.ndarray:
-    """Join consecutive structural springs along one axis, int32 [count, 2].
+    """Return the pairs of consecutive structural springs along one axis that bend springs span, int32 [count, 2].
 
     A particle has at most two springs towards one side: where cells that meet in it only along an edge part.
     """
     first, second = structural.T
+    number = np.arange(len(structural), dtype=np.int32)
     following = np.full((particle_count, 2), -1, np.int32)
     # Written in reverse, the earlier of two springs wins the first column; the other one goes to the second.
-    following[first[::-1], 0] = second[::-1]
-    other = following[first, 0] != second
-    following[first[other], 1] = second[other]
+    following[first[::-1], 0] = number[::-1]
+    other = following[first, 0] != number
+    following[first[other], 1] = number[other]
 
-    pairs = np.full((particle_count, 4, 2), -1, np.int32)
-    start = np.arange(particle_count, dtype=np.int32)
+    under = np.full((particle_count, 4, 2), -1, np.int32)
+    ends = np.full((particle_count, 4), -1, np.int32)
     for slot in range(4):
-        middle = following[:, slot // 2]
-        end = np.where(middle >= 0, following[middle, slot % 2], -1)
-        fresh = (end >= 0) & (end[:, None] != pairs[:, :slot, 1]).all(axis=1)
-        pairs[fresh, slot, 0] = start[fresh]
-        pairs[fresh, slot, 1] = end[fresh]
-    flat = pairs.reshape(-1, 2)
+        near = following[:, slot // 2]
+        far = np.where(near >= 0, following[second[near], slot % 2], -1)
+        end = np.where(far >= 0, second[far], -1)
+        # Two ways around a gap may lead to the same end; one spring is enough.
+        fresh = (end >= 0) & (end[:, None] != ends[:, :slot]).all(axis=1)
+        ends[fresh, slot] = end[fresh]
+        under[fresh, slot, 0] = near[fresh]
+        under[fresh, slot, 1] = far[fresh]
+    flat = under.reshape(-1, 2)
     return flat[flat[:, 0] >= 0]
 
 

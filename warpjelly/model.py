@@ -11,10 +11,12 @@ import warp as wp
 
 from warpjelly.kernels import bounds, contacts, fields, springs
 
-from .lattice import REST_LENGTHS, Lattice, build_lattice
-from .plan import BodyPlan, Plan
+from .errors import InputError
+from .lattice import BEND, BODY_SHEAR, FACE_SHEAR, STRUCTURAL, Lattice
+from .plan import Plan
 from .scene import (
     DEFAULT_PARTICLE_MASS,
+    AnyBody,
     AnyCollider,
     BoxCollider,
     ConstantField,
@@ -30,6 +32,15 @@ from .scene import (
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
 
+# Law young: stiffness of each kind of spring over Young's modulus and the edge of a unit cell, for springs that all
+# cells around them contain. Of the one-parameter family with the same modulus along edges and diagonals, this member
+# gives body diagonals 0.15 and bend springs 0.05.
+YOUNG = {STRUCTURAL: 0.4, FACE_SHEAR: 0.2, BODY_SHEAR: 0.15, BEND: 0.05}
+# Damping over stiffness of law young, unless given, s.
+DAMPING_TIME = 5e-4
+# Boxes of pinned particles are grown by this share of a unit cell, so that rounding decides nothing.
+PIN_MARGIN = 1e-6
+
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -42,9 +53,11 @@ class Body:
     points: slice
     """Its part of surface_particles."""
     quads: np.ndarray
-    """Outward faces, indices into the body's points, int32 [face_count, 4]."""
+    """Outward faces, indices into the body's points, int32 [face_count, 4]; none where its springs are shown."""
+    double_sided: bool
+    """Whether the faces are seen from both sides."""
     unit: float
-    """Edge of a unit cell, m."""
+    """Edge of a unit cell, m; without cells, the shortest rest length."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +72,7 @@ class Model:
     particle_mass: wp.array
     """real [particle_count], kg."""
     particle_inv_mass: wp.array
-    """real [particle_count], 1/kg."""
+    """real [particle_count], 1/kg; 0 for pinned particles."""
     particle_charge: wp.array
     """real [particle_count], C."""
     spans: wp.array
@@ -77,7 +90,7 @@ class Model:
     fields: Any
     """The table of kernels/fields.py."""
     surface_particles: wp.array
-    """int32 [point_count], body after body."""
+    """Particle of each point that is shown, int32 [point_count], body after body."""
     surface_quads: wp.array
     """Indices into surface_particles, vec4i [face_count]."""
 
@@ -115,27 +128,26 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     real = PRECISIONS[scene.solver.precision]
     vector = wp.types.vector(3, real)
     bodies: list[Body] = []
-    positions, velocities, masses, charges, spans, classes, chunks, chunk_bodies = [], [], [], [], [], [], [], []
+    positions, velocities, masses, inverse_masses, charges = ([] for _ in range(5))
+    spans, classes, chunks, chunk_bodies = ([] for _ in range(4))
     surface_particles, surface_quads = [], []
-    particle_count = point_count = spring_count = 0
+    particle_count = point_count = spring_count = class_count = 0
     for number, body_plan in enumerate(plan.bodies):
         body, material = body_plan.body, scene.materials[body_plan.body.material]
-        lattice = build_lattice(
-            body_plan.cells,
-            origin=body_plan.origin,
-            cell_size=body_plan.cell_size,
-            particles_per_edge=body_plan.particles_per_edge,
-        )
+        lattice = body_plan.build()
         count = len(lattice.particles)
         mass = _masses(lattice, material)
-        x, v = place(lattice, mass, body_plan)
+        pinned = _pinned(lattice, body)
+        x, v = place(lattice, mass, body)
+        v[pinned] = 0.0
         positions.append(x)
         velocities.append(v)
         masses.append(mass)
+        inverse_masses.append(np.where(pinned, 0.0, 1.0 / mass))
         charges.append(np.full(count, body.charge))
-        body_spans = springs_to_spans(lattice.springs, lattice.spring_kinds)
-        spans.append(body_spans + np.array([particle_count, particle_count, 0, 4 * number], np.int32))
-        classes.append(spring_classes(material, lattice.unit))
+        body_spans = springs_to_spans(lattice.springs, lattice.spring_classes)
+        spans.append(body_spans + np.array([particle_count, particle_count, 0, class_count], np.int32))
+        classes.append(spring_classes(material, lattice))
         chunks.append(np.arange(particle_count, particle_count + count, CHUNK_SIZE, dtype=np.int32))
         chunk_bodies.append(np.full(len(chunks[-1]), number, np.int32))
         surface_particles.append(lattice.surface_particles + np.int32(particle_count))
@@ -147,12 +159,14 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
                 particles=slice(particle_count, particle_count + count),
                 points=slice(point_count, point_count + points),
                 quads=lattice.surface_quads,
+                double_sided=lattice.double_sided,
                 unit=lattice.unit,
             )
         )
         particle_count += count
         point_count += points
         spring_count += len(lattice.springs)
+        class_count += len(classes[-1])
 
     def array(data: Any, dtype: Any) -> wp.array:
         return wp.array(np.asarray(data), dtype=dtype, device=device)
@@ -166,7 +180,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         particle_count=particle_count,
         spring_count=spring_count,
         particle_mass=array(mass, real),
-        particle_inv_mass=array(1.0 / mass, real),
+        particle_inv_mass=array(np.concatenate(inverse_masses), real),
         particle_charge=array(np.concatenate(charges), real),
         spans=array(np.concatenate(spans), wp.vec4i),
         spring_classes=array(np.concatenate(classes), vector),
@@ -196,15 +210,41 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     return model, state
 
 
-def springs_to_spans(ends: np.ndarray, kinds: np.ndarray) -> np.ndarray:
-    """Join springs whose two ends both advance by one, int32 [span_count, 4] = (i, j, count, kind).
+def launch_spring_forces(
+    model: Model, classes: wp.array, x: wp.array, v: wp.array, f: wp.array, *, loss_weight: float, losses: wp.array
+) -> None:
+    """Add the forces of all springs, by the kernel that suits the device.
+
+    Args:
+        model: has the spans.
+        classes: (rest length, stiffness, damping) of each class, real vec3 [class_count].
+        x: positions, real [3, particle_count], m.
+        v: velocities, m/s.
+        f: forces to add to, N.
+        loss_weight: what the power of the dampers counts for in the losses, s.
+        losses: energy taken by the dampers of each span, to add to, float64 [span_count], J.
+    """
+    on_cpu = model.spans.device.is_cpu
+    wp.launch(
+        springs.add_span_forces if on_cpu else springs.add_spring_forces,
+        dim=len(model.spans) if on_cpu else (len(model.spans), springs.MAX_SPAN),
+        inputs=[model.spans, classes, x, v, model.real(loss_weight)],
+        outputs=[f, losses],
+        device=model.spans.device,
+    )
+
+
+def springs_to_spans(ends: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """Join springs whose two ends both advance by one, int32 [span_count, 4] = (i, j, count, class).
 
     Args:
         ends: particles of each spring, int32 [spring_count, 2].
-        kinds: class of each spring, int [spring_count].
+        classes: class of each spring, int [spring_count].
     """
+    if len(ends) == 0:
+        return np.zeros((0, 4), np.int32)
     first, second = ends.T
-    breaks = np.flatnonzero((np.diff(first) != 1) | (np.diff(second) != 1) | (np.diff(kinds) != 0)) + 1
+    breaks = np.flatnonzero((np.diff(first) != 1) | (np.diff(second) != 1) | (np.diff(classes) != 0)) + 1
     start = np.concatenate([[0], breaks])
     length = np.diff(np.append(start, len(ends)))
     # Long runs are cut into pieces of MAX_SPAN.
@@ -212,22 +252,48 @@ def springs_to_spans(ends: np.ndarray, kinds: np.ndarray) -> np.ndarray:
     piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
     begin = np.repeat(start, pieces) + springs.MAX_SPAN * piece
     end = np.minimum(begin + springs.MAX_SPAN, np.repeat(start + length, pieces))
-    spans = np.stack([first[begin], second[begin], end - begin, kinds[begin]], axis=1).astype(np.int32)
+    spans = np.stack([first[begin], second[begin], end - begin, classes[begin]], axis=1).astype(np.int32)
     # The springs of a particle close together in time find it still in the cache.
     return spans[np.argsort(spans[:, 0], kind="stable")]
 
 
-def spring_classes(material: Material, unit: float) -> np.ndarray:
-    """Return (rest length [m], stiffness [N/m], damping [N s/m]) of the four kinds of springs, float64 [4, 3].
+def spring_classes(material: Material, lattice: Lattice) -> np.ndarray:
+    """Return (rest length [m], stiffness [N/m], damping [N s/m]) of each class of springs, float64 [class_count, 3].
 
     The law "strain", k_s (l/r - 1) with damping d_s / r, is Hooke's with k = k_s / r and d = d_s / r.
     """
-    constants = [material.structural, material.shear, material.shear, material.bend]
-    rest = REST_LENGTHS * unit
-    scale = 1.0 / rest if material.law == "strain" else np.ones(4)
-    stiffness = scale * [c.stiffness for c in constants]
-    damping = scale * [c.damping for c in constants]
+    classes = lattice.classes
+    rest = classes.rest_lengths
+    if material.law == "young":
+        return np.stack([rest, *_young(material, lattice)], axis=1)
+    constants = {
+        STRUCTURAL: material.structural,
+        FACE_SHEAR: material.shear,
+        BODY_SHEAR: material.shear,
+        BEND: material.bend,
+    }
+    scale = 1.0 / rest if material.law == "strain" else np.ones(len(rest))
+    stiffness = scale * [constants[kind].stiffness for kind in classes.kinds]
+    damping = scale * [constants[kind].damping for kind in classes.kinds]
     return np.stack([rest, stiffness, damping], axis=1)
+
+
+def _young(material: Material, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
+    """Return stiffness [N/m] and damping [N s/m] of each class of springs of a solid, float64 [class_count] each.
+
+    A spring on the surface is in fewer cells than one inside, and weaker by as much: then every cell resists strain
+    alike, wherever it is. A bend spring adds twice its stiffness to each of the two structural springs under it, which
+    give up as much.
+    """
+    kinds, cells, bends = lattice.classes.kinds, lattice.classes.cells, lattice.classes.bends
+    assert cells is not None and bends is not None and material.youngs_modulus is not None
+    # How many cells contain a spring inside: 4 around an edge, 2 at a face, 1 around a body diagonal.
+    share = cells / np.array([4, 2, 1, 4])[kinds]
+    stiffness = np.array([YOUNG[kind] for kind in range(4)])[kinds] * share
+    edge = kinds == STRUCTURAL
+    stiffness[edge] += YOUNG[BEND] * (4 * share[edge] - 2 * bends[edge] / 4)
+    stiffness *= material.youngs_modulus * lattice.unit
+    return stiffness, stiffness * (DAMPING_TIME if material.damping_time is None else material.damping_time)
 
 
 def _masses(lattice: Lattice, material: Material) -> np.ndarray:
@@ -242,9 +308,32 @@ def _center_of_mass(positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
     return mass @ positions / mass.sum()
 
 
-def place(lattice: Lattice, mass: np.ndarray, plan: BodyPlan) -> tuple[np.ndarray, np.ndarray]:
+def _pinned(lattice: Lattice, body: AnyBody) -> np.ndarray:
+    """Return which particles never move, bool [particle_count].
+
+    Raises:
+        InputError: an entry pins a particle that does not exist, or none at all.
+    """
+    x = lattice.particles
+    pinned = np.zeros(len(x), bool)
+    for number, pin in enumerate(body.pinned):
+        key = f"bodies.{body.name}.pinned.{number}"
+        if pin.indices is not None:
+            if max(pin.indices) >= len(x):
+                raise InputError(f"{key}.indices: no particle {max(pin.indices)}; they are 0 to {len(x) - 1}")
+            pinned[pin.indices] = True
+        else:
+            margin = PIN_MARGIN * lattice.unit
+            inside = ((x >= np.array(pin.lower) - margin) & (x <= np.array(pin.upper) + margin)).all(axis=1)
+            if not inside.any():
+                low, high = (np.array2string(corner, precision=4, separator=", ") for corner in (x.min(0), x.max(0)))
+                raise InputError(f"{key}: pins no particle; the body reaches from {low} to {high} m in its own frame")
+            pinned |= inside
+    return pinned
+
+
+def place(lattice: Lattice, mass: np.ndarray, body: AnyBody) -> tuple[np.ndarray, np.ndarray]:
     """Return positions and velocities of a body at time zero, float64 [particle_count, 3] each."""
-    body = plan.body
     turn = np.eye(3)
     for axis, angle in enumerate(np.radians(body.rotation)):
         u, w = (axis + 1) % 3, (axis + 2) % 3
@@ -322,13 +411,11 @@ def _collider_rows(collider: AnyCollider, scene: Scene, centers_of_mass: Sequenc
     """Return the members of the table of kernels/contacts.py for one collider of the scene."""
     center = np.array(collider.center)
     everywhere = np.ones(len(centers_of_mass))
-    defaults = scene.contact
+    contact = scene.contact_of(collider)
     row: dict[str, Any] = {"center": center, "side": everywhere, "entry_normal": False}
-    for name in ("stiffness", "damping", "static_friction", "dynamic_friction", "pulls"):
-        own = getattr(collider, name)
-        row[name] = getattr(defaults, name) if own is None else own
-    row["normal_force_term"] = defaults.normal_force_term
-    row["applied_friction"] = defaults.friction_normal == "applied"
+    for name in ("stiffness", "damping", "static_friction", "dynamic_friction", "pulls", "normal_force_term"):
+        row[name] = getattr(contact, name)
+    row["applied_friction"] = contact.friction_normal == "applied"
     if isinstance(collider, SphereCollider):
         radius = np.full(3, collider.radius)
         up = np.eye(3)[scene.up]

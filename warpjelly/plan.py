@@ -1,17 +1,20 @@
-"""What a scene will take, before it is built: the grid of every body, counts and memory."""
+"""What a scene will take, before it is built: how every body is made, counts and memory."""
 
 from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from .errors import InputError
-from .lattice import count_lattice
-from .scene import MAX_LENGTH, MIN_LENGTH, Body, CubeBody, ModelBody, Scene, VoxelsBody
+from .lattice import Lattice, build_lattice, count_lattice
+from .network import build_cloth, build_network
+from .scene import MAX_LENGTH, MIN_LENGTH, AnyBody, ClothBody, CubeBody, ModelBody, NetworkBody, Scene
 
 log = logging.getLogger("warpjelly")
 
@@ -32,21 +35,20 @@ BYTES_PER_GRID_CELL = 4
 
 @dataclass(frozen=True)
 class BodyPlan:
-    """One body as a grid of jelly cubes."""
+    """One body, ready to be built."""
 
-    body: Body
-    cells: np.ndarray
-    """Occupied jelly cubes, bool [nx, ny, nz]."""
-    origin: np.ndarray
-    """Lowest corner of the grid in the frame of the body, float64 [3], m."""
-    cell_size: float
-    """Edge of a jelly cube, m."""
-    particles_per_edge: int
+    body: AnyBody
+    build: Callable[[], Lattice]
+    """Makes its particles, springs and surface."""
     particle_count: int
     spring_bound: int
     """No more springs than this."""
     surface_bound: int
     """About as many points on the surface as this."""
+    voxel_count: int = 0
+    """Number of jelly cubes."""
+    grid_size: int = 0
+    """Number of unit cells of its grid, occupied or not."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,7 @@ class Plan:
     @property
     def voxel_count(self) -> int:
         """Number of jelly cubes."""
-        return sum(int(np.count_nonzero(plan.cells)) for plan in self.bodies)
+        return sum(plan.voxel_count for plan in self.bodies)
 
     @property
     def particle_count(self) -> int:
@@ -74,7 +76,7 @@ class Plan:
     @property
     def memory_bytes(self) -> int:
         """Estimated peak of memory, bytes."""
-        unit_cells = max(plan.cells.size * (plan.particles_per_edge - 1) ** 3 for plan in self.bodies)
+        unit_cells = max(plan.grid_size for plan in self.bodies)
         return int(
             BYTES_AT_REST
             + BYTES_PER_UNIT_CELL * unit_cells
@@ -85,12 +87,12 @@ class Plan:
 
 
 def plan_scene(scene: Scene) -> Plan:
-    """Make the grid of every body and count what follows from it.
+    """Find out how every body is made and count what follows from it.
 
     Raises:
         InputError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
-    plan = Plan(scene, [_plan_body(body) for body in scene.bodies])
+    plan = Plan(scene, [_plan_body(body, scene) for body in scene.bodies])
     most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]
     if plan.particle_count > most:
         raise InputError(f"{plan.particle_count:,} particles are more than the {most:,} that arrays can hold")
@@ -98,19 +100,35 @@ def plan_scene(scene: Scene) -> Plan:
     return plan
 
 
-def _plan_body(body: Body) -> BodyPlan:
+def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
+    """Say how a body is made: the one place that knows every kind."""
+    if isinstance(body, NetworkBody):
+        build = partial(build_network, body.points, body.springs(), body.rest_lengths)
+        springs = sum(map(len, body.springs()))
+        return BodyPlan(body, build, len(body.points), springs, 2 * springs)
+    if isinstance(body, ClothBody):
+        particles = body.particles[0] * body.particles[1]
+        return BodyPlan(body, partial(build_cloth, body.size, body.particles), particles, 6 * particles, particles)
     if isinstance(body, CubeBody):
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
-    elif isinstance(body, VoxelsBody):
-        cells, cell_size = body.grid(), body.cell_size
-        origin = -np.array(cells.shape) * cell_size / 2
     elif isinstance(body, ModelBody):
         cells, origin, cell_size = _voxelize_model(body)
     else:
-        raise TypeError(f"unknown body {type(body).__name__}")
-    counts = count_lattice(cells, particles_per_edge=body.particles_per_edge)
-    return BodyPlan(body, cells, origin, cell_size, body.particles_per_edge, *counts)
+        cells, cell_size = body.grid(), body.cell_size
+        origin = -np.array(cells.shape) * cell_size / 2
+    per_edge = body.particles_per_edge
+    build = partial(
+        build_lattice,
+        cells,
+        origin=origin,
+        cell_size=cell_size,
+        particles_per_edge=per_edge,
+        weighted=scene.materials[body.material].law == "young",
+    )
+    counts = count_lattice(cells, particles_per_edge=per_edge)
+    voxels, unit_cells = int(np.count_nonzero(cells)), cells.size * (per_edge - 1) ** 3
+    return BodyPlan(body, build, *counts, voxels, unit_cells)
 
 
 def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:

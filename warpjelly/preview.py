@@ -108,7 +108,7 @@ def _chosen_frames(stage: Usd.Stage, source: Path, frames: Sequence[int] | None)
 def _brightest_frame(stage: Usd.Stage, first: int, last: int) -> int:
     """Return the frame with the brightest bodies: along the colour map, that is the one with the greatest forces."""
     brightness = np.zeros(last - first + 1)
-    for mesh in _shapes(stage, UsdGeom.Mesh):
+    for mesh in _shapes(stage, UsdGeom.PointBased):
         primvar = UsdGeom.Primvar(mesh.GetDisplayColorAttr())
         if primvar.ValueMightBeTimeVarying():
             brightness += [np.sum(np.array(primvar.ComputeFlattened(t))[:, 1]) for t in range(first, last + 1)]
@@ -138,7 +138,12 @@ def _render(pyvista: Any, stage: Usd.Stage, frame: int, size: tuple[int, int]) -
     rooms = []
     for curves in _shapes(stage, UsdGeom.BasisCurves):
         points = np.array(curves.GetPointsAttr().Get(frame)).reshape(-1, 3)
-        rooms.append(pyvista.line_segments_from_points(points).transform(matrix(curves), inplace=False))
+        lines = pyvista.line_segments_from_points(points).transform(matrix(curves), inplace=False)
+        if curves.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.vertex:
+            lines["color"] = _colors(curves, frame, len(points))
+            solids.append(lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True))
+        else:
+            rooms.append(lines)
     if not solids:
         raise InputError("the stage has nothing to show")
 

@@ -13,6 +13,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from warpjelly.kernels.integrators import STAGES
+
 from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
 from .expect import Observer, Outcome
 from .files import whole_file
@@ -83,6 +85,7 @@ def simulate(
     plan = plan_scene(scene)
     sim = Simulator(plan, device=device)
     _warn_of_deep_starts(sim)
+    _warn_of_long_steps(sim)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # Without its record a run does not count as finished. The old stage stays until the new one is whole.
@@ -107,11 +110,9 @@ def _refuse_to_replace(folder: Path) -> None:
 def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callable[[int, int], None]) -> Run:
     scene, total = sim.scene, sim.scene.frame_count
     meshes = [
-        SurfaceMesh(body.name, surface.points, surface.normals, body.quads)
+        SurfaceMesh(body.name, surface.points, surface.normals, body.quads, body.double_sided)
         for body, surface in zip(sim.model.bodies, sim.surfaces(), strict=True)
     ]
-    _warn_of_deep_starts(sim)
-    _warn_of_long_steps(sim)
     writer = StageWriter(folder / STAGE_NAME, scene=scene, meshes=meshes, provenance=provenance(scene, sim))
     observer = Observer(sim)
     sim.prepare()
@@ -138,7 +139,8 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
     finally:
         # Whatever happens, also what nobody foresaw: the frames that were finished are saved.
         writer.close()
-    evaluations = max(frames - 1, 0) * sim.substeps
+    stages = len(STAGES.get(scene.solver.integrator, [None]))
+    forces = max(frames - 1, 0) * sim.substeps * stages
     outcomes = observer.outcomes()
     record = {
         "scene": scene.name,
@@ -153,7 +155,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         "dt": sim.dt,
         "precision": scene.solver.precision,
         "wall_seconds": time.perf_counter() - began,
-        "springs_per_second": sim.model.spring_count * evaluations / stepping if evaluations else 0.0,
+        "springs_per_second": sim.model.spring_count * forces / stepping if forces else 0.0,
         "diverged": isinstance(ended, DivergedError),
         "interrupted": isinstance(ended, KeyboardInterrupt),
         "expect": [outcome.as_dict() for outcome in outcomes],
@@ -239,6 +241,14 @@ def _metrics_row(index: int, seconds: float, figures: Mapping[str, Any]) -> dict
         else:
             row[name] = value
     return row
+
+
+def _warn_of_long_steps(sim: Simulator) -> None:
+    effort = evaluations(sim.model)
+    if effort * sim.model.spring_count > LIMIT_SPRINGS and effort > LIMIT_SHARE * sim.substeps * sim.scene.frame_count:
+        return
+    if broken := sim.broken_limit():
+        log.warning("%s", broken)
 
 
 def _warn_of_deep_starts(sim: Simulator) -> None:

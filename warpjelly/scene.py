@@ -13,17 +13,19 @@ import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, NoReturn, Self
 
 import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
     Field,
+    SerializerFunctionWrapHandler,
     StringConstraints,
     ValidationInfo,
     WithJsonSchema,
     field_validator,
+    model_serializer,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
@@ -53,8 +55,16 @@ Vector = tuple[Number, Number, Number]
 Rates = tuple[Rate, Rate, Rate]
 Point = tuple[Coordinate, Coordinate, Coordinate]
 Switch = Annotated[bool, Field(strict=True)]
+Index = Annotated[int, Field(strict=True, ge=0)]
+Side = Annotated[int, Field(strict=True, ge=2, le=4096)]
+_SPRING_KINDS = ("structural", "shear", "bend")
 # Names become prim names in the stage, so they are USD identifiers.
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$", max_length=64)]
+
+
+def refuse(key: str, value: object, why: str) -> NoReturn:
+    """Refuse the value of a key, dotted from the table that is being validated; None for a value that is missing."""
+    raise PydanticCustomError("scene", "{why}", {"key": key, "why": why, "value": value})
 
 
 class Table(BaseModel):
@@ -81,7 +91,7 @@ class Solver(Table):
     integrator: Literal["explicit_euler", "semi_implicit_euler", "rk2", "rk4"] = Field(
         "semi_implicit_euler", description="time integration scheme; rk2 is the midpoint rule, rk4 the classical one"
     )
-    dt: float = Field(
+    dt: Step | Literal["auto"] = Field(
         1e-3,
         description="largest time step, s; the step used is the largest one below it that divides a frame; "
         "auto: a safe share of the largest stable step",
@@ -110,13 +120,19 @@ class SpringConstants(Table):
 class Material(Table):
     """What a body is made of."""
 
-    law: Literal["strain", "hooke"] = Field(
-        "strain", description="strain: force = k (l/r - 1), the same at every spring length; hooke: force = k (l - r)"
+    law: Literal["strain", "hooke", "young"] = Field(
+        "strain",
+        description="strain: force = k (l/r - 1), the same at every spring length; hooke: force = k (l - r); "
+        "young: hooke with constants that follow from youngs_modulus, the same body at every resolution",
     )
     particle_mass: Mass | None = Field(
         None, description=f"kg, the same for every particle; {DEFAULT_PARTICLE_MASS} unless density is given"
     )
     density: Mass | None = Field(None, description="kg/m^3; an eighth of a unit cell's mass goes to each corner")
+    youngs_modulus: Positive | None = Field(None, description="Pa; with law young, and required there")
+    damping_time: NotNegative | None = Field(
+        None, description="damping over stiffness of every spring, s; with law young, 5e-4 unless given"
+    )
     structural: SpringConstants = Field(SpringConstants(), description="springs to the 6 direct neighbours")
     shear: SpringConstants = Field(SpringConstants(), description="springs to the 12 face and 8 body diagonals")
     bend: SpringConstants = Field(SpringConstants(), description="springs to the second neighbours along each axis")
@@ -127,9 +143,48 @@ class Material(Table):
             raise PydanticCustomError("mass", "give particle_mass or density, not both")
         return self
 
+    @model_validator(mode="after")
+    def _keys_go_with_the_law(self) -> Self:
+        young = self.law == "young"
+        needed = ("youngs_modulus", "density") if young else ()
+        unused = (*_SPRING_KINDS, "particle_mass") if young else ("youngs_modulus", "damping_time")
+        for key in unused:
+            if key in self.model_fields_set and getattr(self, key) is not None:
+                takes = "youngs_modulus, density and damping_time" if young else ", ".join(_SPRING_KINDS)
+                refuse(key, None, f"does not go with law {self.law}, which takes {takes}")
+        for key in needed:
+            if getattr(self, key) is None:
+                refuse(key, None, "missing; law young requires this key")
+        return self
+
+    @model_serializer(mode="wrap")
+    def _leave_out_what_the_law_does_not_take(self, serialize: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        data: dict[str, Any] = serialize(self)
+        return {key: value for key, value in data.items() if self.law != "young" or key not in _SPRING_KINDS}
+
+
+class Pin(Table):
+    """Particles that never move: some by number, or all in a box."""
+
+    indices: list[Index] | None = Field(None, min_length=1, description="numbers of particles in the body")
+    lower: Point | None = Field(None, description="lowest corner of the box, in the body before it is placed, m")
+    upper: Point | None = Field(None, description="highest corner of the box, m")
+
+    @model_validator(mode="after")
+    def _one_way_is_chosen(self) -> Self:
+        box = (self.lower, self.upper)
+        if (self.indices is None) == (box == (None, None)) or (self.indices is None and None in box):
+            raise PydanticCustomError("pin", "give indices, or lower and upper")
+        if self.lower and self.upper and any(a > b for a, b in zip(self.lower, self.upper, strict=True)):
+            refuse("lower", list(self.lower), f"must not be above upper, {list(self.upper)}")
+        return self
+
 
 class Body(Table):
-    """What all bodies have: a name, a material and a placement."""
+    """What all bodies have: a name, a material, a placement and, maybe, particles that stay where they are."""
+
+    has_volume: ClassVar[bool] = True
+    """Whether the body is made of cells, which a density and Young's modulus need."""
 
     name: Name | None = Field(None, description="prim name in the stage; the type and a number unless given")
     material: Name = Field(description="one of [materials]")
@@ -138,6 +193,7 @@ class Body(Table):
     velocity: Rates = Field((0.0, 0.0, 0.0), description="of the centre of mass, m/s")
     angular_velocity: Rates = Field((0.0, 0.0, 0.0), description="about the centre of mass, rad/s")
     charge: Number = Field(0.0, description="of each particle, C; what electric and magnetic fields act on")
+    pinned: list[Pin] = Field([], description="particles that never move, whatever the body's velocity; none if empty")
 
 
 class CubeBody(Body):
@@ -245,6 +301,55 @@ class Contact(Table):
     friction_normal: Literal["reaction", "applied"] = Field(
         "reaction", description="friction is a share of the collider's force, or of what presses the particle in"
     )
+
+
+class NetworkBody(Body):
+    """Points and the springs between them, as given; the origin is that of the points."""
+
+    has_volume: ClassVar[bool] = False
+    type: Literal["network"]
+    points: list[Point] = Field(min_length=1, description="where the particles start, m")
+    structural: list[tuple[Index, Index]] = Field([], description="pairs of points, joined by structural springs")
+    shear: list[tuple[Index, Index]] = Field([], description="pairs of points, joined by shear springs")
+    bend: list[tuple[Index, Index]] = Field([], description="pairs of points, joined by bend springs")
+    rest_lengths: list[Length] | None = Field(
+        None,
+        description="m, one for each spring: the structural ones, then shear, then bend; "
+        "the distances of the points unless given",
+    )
+
+    @model_validator(mode="after")
+    def _springs_join_points(self) -> Self:
+        taken: dict[frozenset[int], str] = {}
+        for kind in _SPRING_KINDS:
+            for number, (i, j) in enumerate(getattr(self, kind)):
+                key, ends = f"{kind}.{number}", [i, j]
+                if max(i, j) >= len(self.points):
+                    refuse(key, ends, f"there is no particle {max(i, j)}; points are 0 to {len(self.points) - 1}")
+                if i == j:
+                    refuse(key, ends, "a spring joins two different particles")
+                if earlier := taken.get(frozenset(ends)):
+                    refuse(key, ends, f"these particles are joined by {earlier} already")
+                taken[frozenset(ends)] = key
+                if self.rest_lengths is None and math.dist(self.points[i], self.points[j]) < MIN_LENGTH:
+                    why = f"its rest length must be at least {MIN_LENGTH:g} m: move a point, or give rest_lengths"
+                    refuse(key, ends, why)
+        if self.rest_lengths is not None and len(self.rest_lengths) != len(taken):
+            refuse("rest_lengths", self.rest_lengths, f"{len(self.rest_lengths)} of them for {len(taken)} springs")
+        return self
+
+    def springs(self) -> list[list[tuple[int, int]]]:
+        """Return both ends of the springs: structural, shear, bend."""
+        return [self.structural, self.shear, self.bend]
+
+
+class ClothBody(Body):
+    """A rectangular sheet in the body's x-z plane; its origin is its centre."""
+
+    has_volume: ClassVar[bool] = False
+    type: Literal["cloth"]
+    size: tuple[Length, Length] = Field((1.0, 1.0), description="sides along x and z, m")
+    particles: tuple[Side, Side] = Field((16, 16), description="particles along the sides, at least 2 each")
 
 
 class Collider(Table):
@@ -506,7 +611,7 @@ class Expect(Table):
                 yield name, expectation
 
 
-AnyBody = Annotated[CubeBody | VoxelsBody | ModelBody, Field(discriminator="type")]
+AnyBody = Annotated[CubeBody | VoxelsBody | ModelBody | NetworkBody | ClothBody, Field(discriminator="type")]
 AnyCollider = Annotated[HalfSpaceCollider | PlaneCollider | SphereCollider | BoxCollider, Field(discriminator="type")]
 AnyField = Annotated[ConstantField | GridField | ElectricField | MagneticField, Field(discriminator="type")]
 
@@ -557,9 +662,6 @@ class Scene(Table):
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
-        def refuse(key: str, value: object, why: str) -> None:
-            raise PydanticCustomError("scene", "{why}", {"key": key, "why": why, "value": value})
-
         for key, parts in (("bodies", self.bodies), ("colliders", self.colliders)):
             for i, part in enumerate(parts):
                 if part.name in [earlier.name for earlier in parts[:i]]:
@@ -568,6 +670,10 @@ class Scene(Table):
             if body.material not in self.materials:
                 known = ", ".join(self.materials)
                 refuse(f"bodies.{i}.material", body.material, f"no such material; materials of this scene: {known}")
+            material = self.materials[body.material]
+            if not body.has_volume and material.density is not None:
+                why = f"it has a density, but a {body.type} has no volume: use particle_mass, and law strain or hooke"
+                refuse(f"bodies.{i}.material", body.material, why)
         for quantity, expectation in self.expect.items():
             bodies = ", ".join(str(body.name) for body in self.bodies)
             if expectation.body is None and len(self.bodies) > 1:
@@ -578,12 +684,13 @@ class Scene(Table):
             refuse("duration", self.duration, "give duration or frames, not both")
         if self.duration is not None and not 1 <= round(self.duration * self.fps) <= MAX_FRAMES:
             refuse("duration", self.duration, f"at {self.fps:g} fps this is not between 1 and {MAX_FRAMES} frames")
-        steps = self.solver.steps_per_frame
-        if steps is not None and self.solver.dt == "auto":
-            refuse("solver.dt", "auto", "give a number with solver.steps_per_frame")
-        if steps is not None and not math.isclose(self.fps * steps * self.solver.dt, 1.0, rel_tol=1e-9):
-            fps = 1.0 / (steps * self.solver.dt)
-            refuse("fps", self.fps, f"leave it out; solver.steps_per_frame and solver.dt make it {fps:.9g}")
+        steps, dt = self.solver.steps_per_frame, self.solver.dt
+        if steps is not None:
+            if dt == "auto":
+                refuse("solver.dt", "auto", "give a number with solver.steps_per_frame")
+            if not math.isclose(self.fps * steps * dt, 1.0, rel_tol=1e-9):
+                fps = 1.0 / (steps * dt)
+                refuse("fps", self.fps, f"leave it out; solver.steps_per_frame and solver.dt make it {fps:.9g}")
         if self.solver.dt != "auto" and self.substeps_for(self.solver.dt) > MAX_SUBSTEPS:
             refuse("solver.dt", self.solver.dt, f"more than {MAX_SUBSTEPS} substeps a frame at {self.fps:g} fps")
         return self
@@ -592,6 +699,11 @@ class Scene(Table):
     def frame_count(self) -> int:
         """Number of samples, at time codes 0 to ``frame_count - 1``; the first is the initial state."""
         return self.frames if self.frames is not None else round((self.duration or 2.0) * self.fps)
+
+    def contact_of(self, collider: AnyCollider) -> Contact:
+        """Return how a collider pushes back: what it says itself, and [contact] where it says nothing."""
+        own = {name: value for name in Contact.model_fields if (value := getattr(collider, name, None)) is not None}
+        return self.contact.model_copy(update=own)
 
     def substeps_for(self, largest: float) -> int:
         """Return the substeps per frame of the largest step that divides a frame and does not exceed ``largest``, s."""

@@ -102,10 +102,11 @@ def _explain(error: ValidationError) -> str:
     first = problems[0]
     context = first.get("ctx", {})
     value = first["input"]
-    key = context["key"] if first["type"] == "scene" else _key(first["loc"])
+    key = _key(first["loc"])
     what = first["msg"].replace("Input should", "must").replace("Value should", "must")
-    if first["type"] == "unknown_key":
+    if first["type"] in ("unknown_key", "scene"):
         key = ".".join(filter(None, [key, context["key"]]))
+    if first["type"] == "unknown_key":
         message = f"{key}: unknown key; {what}"
     elif first["type"] == "missing":
         message = f"{key}: missing; this key is required{_described(first['loc'])}"

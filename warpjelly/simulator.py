@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, springs, surfaces
+from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, surfaces
 
 from .device import choose_device
 from .errors import DivergedError, InputError
-from .model import Model, State, build
+from .model import Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
 from .stability import SAFETY, add_contacts, measure_pairs, step_limits
@@ -372,13 +372,11 @@ class Simulator:
                 ],
                 [state.f, state.field_work],
             )
-        spring_inputs = [model.spans, model.spring_classes, state.x, state.v, weight]
-        spring_outputs = [state.f, state.spring_losses]
-        if on_cpu:
-            self._launch(springs.add_span_forces, len(model.spans), spring_inputs, spring_outputs)
-        else:
-            threads = (len(model.spans), springs.MAX_SPAN)
-            self._launch(springs.add_spring_forces, threads, spring_inputs, spring_outputs)
+        launch_spring_forces(
+            *(model, model.spring_classes, state.x, state.v, state.f),
+            loss_weight=loss_weight,
+            losses=state.spring_losses,
+        )
         if len(model.colliders.kind) == 0:
             return
         chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES

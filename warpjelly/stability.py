@@ -16,9 +16,7 @@ from collections.abc import Callable
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import springs
-
-from .model import Model
+from .model import Model, launch_spring_forces
 
 INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
 # Share of the limit that dt = "auto" takes. Away from rest springs turn and stretch, and the limit is lower: undamped
@@ -195,6 +193,7 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
     """
     device = x.device
     v, f = wp.zeros_like(x), wp.zeros_like(x)
+    losses = wp.zeros(len(model.spans), dtype=wp.float64, device=device)
     classes = model.spring_classes.numpy().astype(float)
     root = np.sqrt(model.particle_inv_mass.numpy().astype(float))
     start = np.random.default_rng(0).standard_normal(x.shape) * (root > 0.0)
@@ -206,12 +205,7 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
         def multiply(vector: np.ndarray) -> np.ndarray:
             v.assign((root * vector).astype(wp.dtype_to_numpy(model.real)))
             f.zero_()
-            inputs = [model.spans, table, x, v]
-            if device.is_cpu:
-                wp.launch(springs.add_span_forces, len(model.spans), inputs=inputs, outputs=[f], device=device)
-            else:
-                lanes = (len(model.spans), springs.MAX_SPAN)
-                wp.launch(springs.add_spring_forces, lanes, inputs=inputs, outputs=[f], device=device)
+            launch_spring_forces(model, table, x, v, f, loss_weight=0.0, losses=losses)
             return -root * f.numpy()
 
         return _lanczos(multiply, start)

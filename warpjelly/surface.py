@@ -18,7 +18,10 @@ class SurfaceMesh:
     normals: np.ndarray
     """Rest normals, float32 [point_count, 3], unit length."""
     quads: np.ndarray
-    """Corners of each face, counter-clockwise from outside, int32 [face_count, 4]."""
+    """Corners of each face, counter-clockwise from outside, int32 [face_count, 4]. A body without faces shows its
+    springs: the points are the two ends of each, one after another."""
+    double_sided: bool = False
+    """Whether the faces are seen from both sides."""
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ _KEY_DIRECTION = (-0.6, 1.2, 0.5)
 _FILL_DIRECTION = (1.0, 0.4, 0.3)
 # Linear grey of everything that is not jelly.
 _COLLIDER_GREY = 0.4
+# Thickness of a spring that is drawn, in typical lengths of the body's springs.
+_SPRING_WIDTH = 0.06
 # Edge of the square that stands for an infinite wall, in diagonals of the motion.
 _WALL_SIZE = 20.0
 # Forces that vary by less than this share of their value are one force and rounding: no range to stretch colours over.
@@ -166,7 +168,12 @@ def _integers(array: np.ndarray) -> Vt.IntArray:
 
 
 def _surface_path(mesh: SurfaceMesh) -> Sdf.Path:
-    return _BODIES.AppendChild(mesh.body).AppendChild("surface")
+    return _BODIES.AppendChild(mesh.body).AppendChild("surface" if len(mesh.quads) else "springs")
+
+
+def _spring_width(mesh: SurfaceMesh) -> float:
+    """Return how thick springs are drawn, m."""
+    return _SPRING_WIDTH * max(float(np.median(np.linalg.norm(mesh.points[1::2] - mesh.points[::2], axis=1))), 1e-3)
 
 
 def _author_surface(
@@ -177,8 +184,12 @@ def _author_surface(
         raise ValueError(f"{mesh.body}: points {surface.points.shape} for a mesh of {mesh.points.shape}")
     path = _surface_path(mesh)
     points = _vectors(surface.points)
-    extent = UsdGeom.PointBased.ComputeExtent(points)
-    samples = {"points": points, "normals": _vectors(surface.normals), "extent": extent}
+    if len(mesh.quads):
+        extent = UsdGeom.PointBased.ComputeExtent(points)
+        samples = {"points": points, "normals": _vectors(surface.normals), "extent": extent}
+    else:
+        extent = UsdGeom.Curves.ComputeExtent(points, [_spring_width(mesh)])
+        samples = {"points": points, "extent": extent}
     if with_velocities:
         samples["velocities"] = _vectors(surface.velocities)
     for name, value in samples.items():
@@ -250,7 +261,13 @@ def _define_lights(stage: Usd.Stage, scene: Scene) -> None:
 def _define_body(stage: Usd.Stage, mesh: SurfaceMesh, scene: Scene) -> None:
     path = _surface_path(mesh)
     Usd.ModelAPI(UsdGeom.Xform.Define(stage, path.GetParentPath())).SetKind(Kind.Tokens.component)
-    surface = _define_mesh(stage, path, mesh.points, mesh.normals, mesh.quads, look="jelly")
+    surface: UsdGeom.PointBased
+    if len(mesh.quads):
+        surface = _define_mesh(stage, path, mesh.points, mesh.normals, mesh.quads, look="jelly")
+        surface.CreateDoubleSidedAttr(mesh.double_sided)
+    else:
+        surface = _define_segments(stage, path, mesh.points, width=_spring_width(mesh))
+        _bind(surface, "jelly")
     if scene.output.velocities:
         surface.CreateVelocitiesAttr()
     color = surface.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
@@ -333,9 +350,14 @@ def _define_edges(stage: Usd.Stage, path: Sdf.Path, box: BoxCollider, *, width: 
     first, second = np.nonzero(np.abs(corners[:, None] - corners).sum(axis=2) == 1)
     edges = np.stack([first, second], axis=1)[first < second]
     points = np.array(box.center) + (corners[edges.ravel()] - 0.5) * box.size
+    return _define_segments(stage, path, points, width=width)
+
+
+def _define_segments(stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, *, width: float) -> UsdGeom.BasisCurves:
+    """Draw straight lines, each from one point to the next of the points, [2 line_count, 3], m."""
     curves = UsdGeom.BasisCurves.Define(stage, path)
     curves.CreateTypeAttr(UsdGeom.Tokens.linear)
-    curves.CreateCurveVertexCountsAttr(_integers(np.full(len(edges), 2)))
+    curves.CreateCurveVertexCountsAttr(_integers(np.full(len(points) // 2, 2)))
     curves.CreatePointsAttr(_vectors(points))
     curves.CreateWidthsAttr([width])
     curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)

@@ -170,6 +170,7 @@ def read_world(path: Path) -> dict[str, Any]:
                 "velocities": velocities,
             }
         ],
+        "contact": {"static_friction": 0.0, "dynamic_friction": 0.0},
         "colliders": [collider | contact | {"pulls": True} for collider in colliders] if contact["stiffness"] else [],
         "fields": fields,
     }
@@ -233,9 +234,11 @@ def _format(scene: Scene) -> str:
     plane, contact = _contact(scene)
     if contact[0] > 0:
         _written(contact[0], "colliders.0.stiffness")
+    _require(scene.solver.dt != "auto", "solver.dt", "is auto; a world has a number")
+    substeps = scene.substeps_for(float(scene.solver.dt))
     lines = [
         names[scene.solver.integrator],
-        f"{_written(scene.dt, 'solver.dt')} {scene.substeps}",
+        f"{_written(scene.dt_for(substeps), 'solver.dt')} {substeps}",
         " ".join(f"{value:.6f}" for value in (*constants, *contact)),
         _written(mass, f"materials.{body.material}.particle_mass"),
         "0" if plane is None else "1\n" + _vector([*plane.normal, -float(np.dot(plane.center, plane.normal))]),
@@ -243,13 +246,12 @@ def _format(scene: Scene) -> str:
     grid = _grid(scene, mass)
     lines.append(str(len(grid)))
     # Everything that imports Warp takes a second, which reading a scene need not spend.
-    from .lattice import build_lattice
     from .model import place
     from .plan import plan_scene
 
     plan = plan_scene(scene).bodies[0]
-    lattice = build_lattice(plan.cells, origin=plan.origin, cell_size=plan.cell_size, particles_per_edge=8)
-    positions, velocities = place(lattice, np.full(len(lattice.particles), mass), plan)
+    lattice = plan.build()
+    positions, velocities = place(lattice, np.full(len(lattice.particles), mass), plan.body)
     lines += [_vector(row) for rows in (grid.reshape(-1, 3), positions, velocities) for row in rows]
     return "\n".join(lines) + "\n"
 
@@ -293,12 +295,16 @@ def _contact(scene: Scene) -> tuple[HalfSpaceCollider | None, tuple[float, float
     if not scene.colliders:
         return None, (0.0, 0.0)
     boxes, planes = [], []
-    first = scene.colliders[0]
+    first = scene.contact_of(scene.colliders[0])
     for i, collider in enumerate(scene.colliders):
         key = f"colliders.{i}"
-        _require(collider.stiffness == first.stiffness, f"{key}.stiffness", "differs between colliders")
-        _require(collider.damping == first.damping, f"{key}.damping", "differs between colliders")
-        _require(collider.pulls or collider.damping == 0, f"{key}.pulls", "is false; contacts of a world pull")
+        contact = scene.contact_of(collider)
+        _require(contact.stiffness == first.stiffness, f"{key}.stiffness", "differs between colliders")
+        _require(contact.damping == first.damping, f"{key}.damping", "differs between colliders")
+        _require(contact.pulls or contact.damping == 0, f"{key}.pulls", "is false; contacts of a world pull")
+        rubs = max(contact.static_friction, contact.dynamic_friction) > 0
+        _require(not rubs, f"{key}.static_friction", "is not 0, or dynamic_friction; a world has no friction")
+        _require(not contact.normal_force_term, "contact.normal_force_term", "is true; a world has no such term")
         if isinstance(collider, BoxCollider):
             fits = collider.size == (2 * BOX_REACH,) * 3 and not any(collider.center)
             _require(fits, key, "is not the box from -2 to 2")
