@@ -15,6 +15,8 @@ wp.set_module_options({"enable_backward": False})
 
 # The search radius is grown by this share, so that rounding in the grid never hides a pair.
 SEARCH_MARGIN = 1e-5
+# Farther from the origin than this [m], no cell of the grid has a number.
+LOST = 1e7
 
 
 @wp.kernel
@@ -26,9 +28,15 @@ def gather_skin(
     # Out:
     points: wp.array(dtype=Any),
 ):
-    """Overwrite the positions of the skin's particles, for the grid to be built over."""
+    """Overwrite the positions of the skin's particles, for the grid to be built over.
+
+    The grid cannot take numbers that are not finite: whoever is lost is put at the origin, to be found after the frame.
+    """
     point = wp.tid()
-    points[point] = vectors.load(x, skin[point])
+    position = vectors.load(x, skin[point])
+    if not (wp.length(position) < type(position[0])(LOST)):
+        position = type(position[0])(0.0) * points[point]
+    points[point] = position
 
 
 @wp.func

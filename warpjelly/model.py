@@ -61,6 +61,28 @@ class Body:
 
 
 @dataclass(frozen=True)
+class Skin:
+    """Particles that collide with other particles, those on the surface of each body; see kernels/pairs.py."""
+
+    particles: wp.array
+    """int32 [skin_count]."""
+    body: wp.array
+    """int32 [skin_count]."""
+    radius: wp.array
+    """real [skin_count], m."""
+    rest: wp.array
+    """Place at rest in the frame of the body, real vec3 [skin_count], m."""
+    neighbor_start: wp.array
+    """First neighbour of each, and the end of the last, int32 [skin_count + 1]."""
+    neighbors: wp.array
+    """Members of the skin that springs join to each, int32 [neighbor_count]."""
+    greatest_radius: float
+    """m."""
+    response: wp.array
+    """(stiffness [N/m], damping [N s/m], friction), real vec3 [1]."""
+
+
+@dataclass(frozen=True)
 class Model:
     """What stays the same over a run. Arrays are on the device; real is float32 or float64."""
 
@@ -93,6 +115,8 @@ class Model:
     """Particle of each point that is shown, int32 [point_count], body after body."""
     surface_quads: wp.array
     """Indices into surface_particles, vec4i [face_count]."""
+    skin: Skin | None
+    """The particles that collide with others, where any do."""
 
 
 @dataclass(frozen=True)
@@ -118,6 +142,8 @@ class State:
     """Energy taken by the dampers of each span, float64 [span_count], J."""
     field_work: wp.array
     """Energy given by fields to each particle, float64 [particle_count], J; empty without fields."""
+    pair_losses: wp.array
+    """Energy taken by damping and friction between particles, float64 [2, skin_count], J."""
     contact_losses: wp.array
     """Energy taken by contact damping and by friction in each chunk, float64 [2, chunk_count], J."""
 
@@ -130,12 +156,15 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     bodies: list[Body] = []
     positions, velocities, masses, inverse_masses, charges = ([] for _ in range(5))
     spans, classes, chunks, chunk_bodies = ([] for _ in range(4))
+    lattices: list[Lattice] = []
     surface_particles, surface_quads = [], []
     particle_count = point_count = spring_count = class_count = 0
     for number, body_plan in enumerate(plan.bodies):
         body, material = body_plan.body, scene.materials[body_plan.body.material]
         lattice = body_plan.build()
         count = len(lattice.particles)
+        if scene.soft_contacts:
+            lattices.append(lattice)
         mass = _masses(lattice, material)
         pinned = _pinned(lattice, body)
         x, v = place(lattice, mass, body)
@@ -191,6 +220,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         fields=_fields(scene, real, device),
         surface_particles=array(np.concatenate(surface_particles), wp.int32),
         surface_quads=array(np.concatenate(surface_quads), wp.vec4i),
+        skin=_skin(scene, lattices, real, device) if scene.soft_contacts else None,
     )
     slots = int(model.colliders.slot.numpy().max(initial=-1)) + 1
     remembered = int(model.colliders.entry_normal.numpy().sum())
@@ -204,6 +234,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         stamps=wp.full((slots, particle_count), -2, dtype=wp.int32, device=device),
         normals=wp.zeros((3 * remembered, particle_count), dtype=real, device=device),
         spring_losses=wp.zeros(len(model.spans), dtype=wp.float64, device=device),
+        pair_losses=wp.zeros((2, len(model.skin.particles) if model.skin else 0), dtype=wp.float64, device=device),
         field_work=wp.zeros(particle_count if scene.fields else 0, dtype=wp.float64, device=device),
         contact_losses=wp.zeros((2, len(model.chunk_body)), dtype=wp.float64, device=device),
     )
@@ -384,6 +415,48 @@ def _fields(scene: Scene, real: type, device: str) -> Any:
     keyframes = np.concatenate(curves)
     table.curve_time, table.curve_factor = (array(np.ascontiguousarray(column), wp.float64) for column in keyframes.T)
     return table
+
+
+def _skin(scene: Scene, lattices: Sequence[Lattice], real: type, device: str) -> Skin:
+    """Return the particles that collide with each other."""
+    particles, bodies, radii, rest, starts, neighbors = [], [], [], [], [], []
+    first = count = neighbor_count = 0
+    for number, lattice in enumerate(lattices):
+        on_skin = np.zeros(len(lattice.particles), bool)
+        on_skin[lattice.surface_particles] = True
+        members = np.flatnonzero(on_skin)
+        member = np.cumsum(on_skin) - 1 + count
+        # Springs within the skin, from both ends, sorted by the first.
+        inner = lattice.springs[on_skin[lattice.springs].all(axis=1)]
+        ends = member[np.concatenate([inner, inner[:, ::-1]])]
+        ends = ends[np.argsort(ends[:, 0], kind="stable")]
+        degree = np.bincount(ends[:, 0] - count, minlength=len(members))
+        starts.append(neighbor_count + np.cumsum(degree) - degree)
+        neighbors.append(ends[:, 1])
+        particles.append(members + first)
+        bodies.append(np.full(len(members), number))
+        own = scene.soft_contact.radius
+        radii.append(np.full(len(members), lattice.unit / 2 if own is None else own))
+        rest.append(lattice.particles[members])
+        first += len(lattice.particles)
+        count += len(members)
+        neighbor_count += len(ends)
+
+    def array(parts: list[np.ndarray], dtype: Any) -> wp.array:
+        return wp.array(np.concatenate(parts), dtype=dtype, device=device)
+
+    contact = scene.soft_contact
+    vector = wp.types.vector(3, real)
+    return Skin(
+        particles=array(particles, wp.int32),
+        body=array(bodies, wp.int32),
+        radius=array(radii, real),
+        rest=array(rest, vector),
+        neighbor_start=array([*starts, np.array([neighbor_count])], wp.int32),
+        neighbors=array(neighbors, wp.int32),
+        greatest_radius=float(max(part.max() for part in radii)),
+        response=array([np.array([[contact.stiffness, contact.damping, contact.friction]])], vector),
+    )
 
 
 def _colliders(scene: Scene, centers_of_mass: Sequence[np.ndarray], real: type, device: str) -> Any:

@@ -352,6 +352,18 @@ class ClothBody(Body):
     particles: tuple[Side, Side] = Field((16, 16), description="particles along the sides, at least 2 each")
 
 
+class SoftContact(Table):
+    """How bodies push each other apart: particles of the skin are balls."""
+
+    mode: Literal["bodies", "all", "off"] = Field(
+        "bodies", description="bodies: different bodies collide; all: a body with itself as well, where it folds over"
+    )
+    stiffness: Positive = Field(1000.0, description="N/m of overlap")
+    damping: NotNegative = Field(0.5, description="N s/m along the line of centres")
+    friction: NotNegative = Field(0.3, description="share of the normal force")
+    radius: Length | None = Field(None, description="of the balls, m; half the edge of a body's unit cell unless given")
+
+
 class Collider(Table):
     """What all colliders have: a name, and what they do otherwise than [contact]."""
 
@@ -631,6 +643,7 @@ class Scene(Table):
     materials: dict[Name, Material] = Field(min_length=1, description="materials by name")
     bodies: list[AnyBody] = Field(min_length=1, description="what is made of jelly")
     contact: Contact = Field(Contact(), description="how colliders push back unless they say otherwise")
+    soft_contact: SoftContact = Field(SoftContact(), description="how bodies push each other apart")
     colliders: list[AnyCollider] = Field([], description="what the bodies collide with")
     fields: list[AnyField] = Field([], description="forces on every particle, besides gravity")
     output: Output = Field(Output(), description="what is written")
@@ -704,6 +717,11 @@ class Scene(Table):
         """Return how a collider pushes back: what it says itself, and [contact] where it says nothing."""
         own = {name: value for name in Contact.model_fields if (value := getattr(collider, name, None)) is not None}
         return self.contact.model_copy(update=own)
+
+    @property
+    def soft_contacts(self) -> bool:
+        """Whether particles may collide with each other."""
+        return self.soft_contact.mode == "all" or (self.soft_contact.mode == "bodies" and len(self.bodies) > 1)
 
     def substeps_for(self, largest: float) -> int:
         """Return the substeps per frame of the largest step that divides a frame and does not exceed ``largest``, s."""

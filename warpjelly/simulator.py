@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, surfaces
+from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, pairs, surfaces
 
 from .device import choose_device
 from .errors import DivergedError, InputError
-from .model import Model, State, build, launch_spring_forces
+from .model import Model, Skin, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
 from .stability import SAFETY, add_contacts, measure_pairs, step_limits
@@ -23,6 +23,8 @@ log = logging.getLogger("warpjelly")
 
 # A captured graph holds at most this many substeps; longer frames replay it. Capturing costs as much as ten replays.
 MAX_CAPTURED_SUBSTEPS = 64
+# Cells along each axis of the grid in which colliding particles are sorted; it repeats beyond.
+GRID_SIZE = 64
 # Warp cannot capture in two threads at once.
 _capture_lock = threading.Lock()
 
@@ -71,6 +73,12 @@ class Simulator:
             self._normals = wp.zeros(point_count, dtype=wp.vec3f)
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
+            if (skin := self.model.skin) is not None:
+                self._with_itself = self.scene.soft_contact.mode == "all"
+                self._grid = wp.HashGrid(GRID_SIZE, GRID_SIZE, GRID_SIZE, dtype=self.model.real)
+                self._grid.reserve(len(skin.particles))
+                self._skin_points = wp.zeros(len(skin.particles), dtype=skin.rest.dtype)
+                self._pair_energies = wp.zeros(len(skin.particles), dtype=wp.float64)
         self._graphs: dict[int, Any] = {}
         self._capturable = True
         # Kernels compile at their first launch, which must not be inside a capture; a step of no time changes nothing.
@@ -216,14 +224,14 @@ class Simulator:
         )
         sums = self._measure_chunks()
         total, greatest = sums.sum(axis=0), sums.max(axis=0)
-        contact_losses = self.state.contact_losses.numpy().sum(axis=1)
+        contact_losses = state.contact_losses.numpy().sum(axis=1) + state.pair_losses.numpy().sum(axis=1)
         penetrations = np.zeros(len(model.bodies))
         np.maximum.at(penetrations, model.chunk_body.numpy(), sums[:, diagnostics.DEPTH])
         return {
             "kinetic": float(total[diagnostics.KINETIC]),
             "elastic": float(self._elastic.numpy()[0]),
             "potential": float(total[diagnostics.POTENTIAL]),
-            "contact": float(total[diagnostics.CONTACT]),
+            "contact": float(total[diagnostics.CONTACT]) + (self._pair_energy(model.skin) if model.skin else 0.0),
             "spring_losses": float(self.state.spring_losses.numpy().sum()),
             "field_work": float(self.state.field_work.numpy().sum()),
             "contact_losses": float(contact_losses[0]),
@@ -349,6 +357,39 @@ class Simulator:
             [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
         )
 
+    def _build_grid(self, skin: Skin) -> None:
+        """Sort the particles of the skin into the grid, at their current positions."""
+        self._launch(pairs.gather_skin, len(skin.particles), [skin.particles, self.state.x], [self._skin_points])
+        self._grid.build(self._skin_points, 2.0 * skin.greatest_radius)
+
+    def _add_pair_forces(self, skin: Skin, loss_weight: float) -> None:
+        model, state, real = self.model, self.state, self.model.real
+        self._build_grid(skin)
+        self._launch(
+            pairs.add_pair_forces,
+            len(skin.particles),
+            [
+                *(skin.particles, skin.body, skin.radius, skin.rest, skin.neighbor_start, skin.neighbors),
+                *(skin.response, model.particle_mass, self._grid.id, self._skin_points, state.v, self._with_itself),
+                *(real(skin.greatest_radius), real(self.dt), real(loss_weight)),
+            ],
+            [state.f, state.pair_losses],
+        )
+
+    def _pair_energy(self, skin: Skin) -> float:
+        """Return the energy stored in overlaps of particles, J."""
+        self._build_grid(skin)
+        self._launch(
+            pairs.measure_pairs,
+            len(skin.particles),
+            [
+                *(skin.body, skin.radius, skin.rest, skin.neighbor_start, skin.neighbors, skin.response),
+                *(self._grid.id, self._skin_points, self._with_itself, self.model.real(skin.greatest_radius)),
+            ],
+            [self._pair_energies],
+        )
+        return float(self._pair_energies.numpy().sum())
+
     def _add_forces(self, *, loss_weight: float, offset: float = 0.0, first: bool = True) -> None:
         """Overwrite the forces with those at the current positions and velocities.
 
@@ -377,6 +418,8 @@ class Simulator:
             loss_weight=loss_weight,
             losses=state.spring_losses,
         )
+        if model.skin is not None:
+            self._add_pair_forces(model.skin, loss_weight)
         if len(model.colliders.kind) == 0:
             return
         chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES
