@@ -192,6 +192,17 @@ def test_mass_and_damping_follow_the_volume_and_the_stiffness() -> None:
     assert (body.stiffness > 0).all()
 
 
+def test_no_spring_pushes_back() -> None:
+    """Join two slabs of 4 cells by a single one, where bend springs over a weak spring join strong ones."""
+    cells = np.ones((2, 2, 3), bool)
+    cells[:, :, 1] = [[True, False], [False, False]]
+    # The edge in the middle is in one cell: 0.6/4 less twice two bend springs of 0.05/4, in E h.
+    body = Solid(cells, edge=0.1)
+    np.testing.assert_allclose(body.stiffness.min() / (E * 0.1), 0.05 / 4, rtol=1e-12)
+    at_neck = (np.abs(body.x[body.ends].mean(axis=1)) < 1e-9).all(axis=1) & np.isclose(body.rest, 0.1)
+    np.testing.assert_allclose(body.stiffness[at_neck] / (E * 0.1), 0.15 - 4 * 0.0125, rtol=1e-12)
+
+
 # What ARCHITECTURE.md states of lattices with the same constant k for every kind of spring. Sums over the springs of a
 # particle inside, k r^2 n n n n / h^3: 1 structural, 4 face, 4 body diagonals and 1 bend spring have a part along x.
 LAWS = {
