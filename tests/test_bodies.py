@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from pxr import UsdGeom
 from reference import EPSILON
 from worlds import make_material, make_scene, make_voxels
 
@@ -14,8 +18,11 @@ from warpjelly.errors import InputError
 from warpjelly.lattice import build_lattice
 from warpjelly.network import build_cloth, build_network
 from warpjelly.plan import plan_scene
+from warpjelly.run import simulate
 from warpjelly.scene import Material
 from warpjelly.simulator import Simulator
+from warpjelly.usd import open_stage
+from warpjelly.validate import stage_problems
 
 YOUNG = {"law": "young", "youngs_modulus": 2e4, "density": 500.0}
 # One body of each kind but models, around the origin, with a material of its own.
@@ -151,7 +158,7 @@ def test_cloth_is_covered_by_faces_once() -> None:
 @pytest.mark.parametrize("weighted", [False, True])
 @pytest.mark.parametrize("seed", range(4))
 def test_springs_know_how_many_cells_contain_them(seed: int, weighted: bool) -> None:
-    """Count the cells of each spring one by one; weights leave springs, particles and faces as they are."""
+    """Share out the cells among the springs; weights leave springs, particles and faces as they are."""
     cells = np.random.default_rng(seed).random((3, 4, 3)) < 0.5
     plain = build_lattice(cells, origin=np.zeros(3), cell_size=1.0)
     lattice = build_lattice(cells, origin=np.zeros(3), cell_size=1.0, weighted=weighted)
@@ -161,14 +168,10 @@ def test_springs_know_how_many_cells_contain_them(seed: int, weighted: bool) -> 
     if not weighted:
         assert classes.cells is None
         return
-    # A cell contains a spring when both ends are at its corners and belong to it; a particle's cells are those whose
-    # corner it is, so the energy of affine strain of test_young.py would show particles mixed up.
-    found = {kind: 0 for kind in range(3)}
-    for kind in found:
-        found[kind] = int(classes.cells[rows[lattice.spring_kinds == kind]].sum())
+    found = {kind: int(classes.cells[rows[lattice.spring_kinds == kind]].sum()) for kind in range(3)}
     # Every cell has 12 edges, 12 face diagonals and 4 body diagonals.
     assert found == {kind: count * np.count_nonzero(cells) for kind, count in enumerate((12, 12, 4))}
-    # The bend springs over structural springs are counted at both of theirs.
+    # Which spring got which share shows in the forces in test_young.py. Bend springs count at both springs under them.
     bend = lattice.spring_kinds == 3
     assert classes.bends[rows].sum() == 2 * classes.cells[rows[bend]].sum()
 
@@ -282,3 +285,58 @@ def test_a_young_material_survives_its_record() -> None:
     """Write a material as run.json does and read it again: keys of other laws must not come back."""
     material = Material.model_validate(YOUNG)
     assert Material.model_validate(material.model_dump(mode="json", exclude_none=True)) == material
+
+
+@pytest.mark.parametrize("output", [{}, {"color": "rgb", "velocities": True, "force_range": (0.0, 5.0)}])
+def test_the_stage_shows_networks_as_curves_and_cloth_from_both_sides(tmp_path: Path, output: dict[str, Any]) -> None:
+    """Find a straight curve for each spring, moving and coloured with its particles, in a sound stage."""
+    names = ("network", "cloth", "cube")
+    run = simulate(make_world(*names, output=output, frames=3), output=tmp_path, device="cpu")
+    assert run.error is None
+    assert stage_problems(tmp_path) == []
+    stage = open_stage(tmp_path)
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath("/World/bodies/network/springs"))
+    assert not stage.GetPrimAtPath("/World/bodies/network/surface")
+    assert curves.GetTypeAttr().Get() == UsdGeom.Tokens.linear
+    assert list(curves.GetCurveVertexCountsAttr().Get()) == [2] * 4
+    simulator = Simulator(make_world(*names, output=output), device="cpu")
+    for frame in range(3):
+        # Structural, shear and bend, as in the scene.
+        expected = simulator.positions[[0, 1, 2, 0, 1, 2, 3, 0]]
+        np.testing.assert_array_equal(curves.GetPointsAttr().Get(frame), expected.astype(np.float32))
+        colors = np.array(UsdGeom.Primvar(curves.GetDisplayColorAttr()).ComputeFlattened(frame))
+        # Both springs at a particle have its colour.
+        np.testing.assert_array_equal(colors[[0, 1, 2]], colors[[3, 4, 5]])
+        simulator.advance_frame()
+    sheet, cube = (UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/bodies/{name}/surface")) for name in ("cloth", "cube"))
+    assert sheet.GetDoubleSidedAttr().Get() and not cube.GetDoubleSidedAttr().Get()
+
+
+def test_a_lone_particle_makes_a_sound_stage(tmp_path: Path) -> None:
+    """Write a particle without springs as a curve of no length."""
+    body = {"type": "network", "name": "dot", "material": "jelly", "points": [[1.0, 2.0, 3.0]]}
+    simulate(make_scene(bodies=[body]), output=tmp_path, device="cpu")
+    assert stage_problems(tmp_path) == []
+    stage = open_stage(tmp_path)
+    curves = UsdGeom.BasisCurves(stage.GetPrimAtPath("/World/bodies/dot/springs"))
+    assert np.array(curves.GetPointsAttr().Get(1)).tolist() == [[1.0, 2.0, 3.0]] * 2
+
+
+@pytest.mark.egl
+def test_a_preview_shows_springs_in_their_colors(tmp_path: Path) -> None:
+    """Draw a network in colour and without a word, particles without springs left out."""
+    from PIL import Image
+
+    body = {**BODIES["network"], "name": "net", "points": [*BODIES["network"]["points"], [0.5, 0.5, 0.5]]}
+    simulate(make_scene(bodies=[body], materials=MATERIALS), output=tmp_path, device="cpu")
+    script = (
+        "import sys; from pathlib import Path; from warpjelly.preview import render_preview\n"
+        "render_preview(Path(sys.argv[1]), Path(sys.argv[2]), size=(320, 180))"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path), str(tmp_path / "p.png")]
+    process = subprocess.run(command, check=True, capture_output=True, text=True)
+    assert process.stdout + process.stderr == ""
+    with Image.open(tmp_path / "p.png") as picture:
+        # Jelly is colourful; the rest is nearly grey, and the legend is in the last sixth.
+        shown = np.ptp(np.asarray(picture.convert("RGB"))[:150].astype(int), axis=2) > 50
+    assert 100 < shown.sum() < shown.size / 4

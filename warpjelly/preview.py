@@ -141,7 +141,9 @@ def _render(pyvista: Any, stage: Usd.Stage, frame: int, size: tuple[int, int]) -
         lines = pyvista.line_segments_from_points(points).transform(matrix(curves), inplace=False)
         if curves.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.vertex:
             lines["color"] = _colors(curves, frame, len(points))
-            solids.append(lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True))
+            tubes = lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True)
+            # Lines of no length, which stand for particles without springs, have no tube.
+            solids += [tubes] if tubes.n_points else []
         else:
             rooms.append(lines)
     if not solids:

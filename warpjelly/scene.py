@@ -166,7 +166,11 @@ class Material(Table):
 class Pin(Table):
     """Particles that never move: some by number, or all in a box."""
 
-    indices: list[Index] | None = Field(None, min_length=1, description="numbers of particles in the body")
+    indices: list[Index] | None = Field(
+        None,
+        min_length=1,
+        description="numbers of particles in the body: a network's points, otherwise in scan order, z fastest",
+    )
     lower: Point | None = Field(None, description="lowest corner of the box, in the body before it is placed, m")
     upper: Point | None = Field(None, description="highest corner of the box, m")
 

@@ -370,7 +370,14 @@ class Simulator:
             len(skin.particles),
             [
                 *(skin.particles, skin.body, skin.radius, skin.rest, skin.neighbor_start, skin.neighbors),
-                *(skin.response, model.particle_mass, self._grid.id, self._skin_points, state.v, self._with_itself),
+                *(
+                    skin.response,
+                    model.particle_mass,
+                    wp.uint64(self._grid.id),
+                    self._skin_points,
+                    state.v,
+                    self._with_itself,
+                ),
                 *(real(skin.greatest_radius), real(self.dt), real(loss_weight)),
             ],
             [state.f, state.pair_losses],
@@ -384,7 +391,12 @@ class Simulator:
             len(skin.particles),
             [
                 *(skin.body, skin.radius, skin.rest, skin.neighbor_start, skin.neighbors, skin.response),
-                *(self._grid.id, self._skin_points, self._with_itself, self.model.real(skin.greatest_radius)),
+                *(
+                    wp.uint64(self._grid.id),
+                    self._skin_points,
+                    self._with_itself,
+                    self.model.real(skin.greatest_radius),
+                ),
             ],
             [self._pair_energies],
         )
