@@ -169,26 +169,23 @@ def normal_reaction(colliders: Any, c: int, counted: Any, speed: Any, pressing: 
 def friction_force(
     colliders: Any, c: int, reaction: Any, pressing: Any, velocity: Any, applied: Any, mass: Any, dt: Any
 ):
-    """Return the friction on a particle; velocity and applied (all forces but reactions) are their tangential parts.
+    """Return the friction on a particle; velocity and applied (all forces but reactions) are the tangential parts.
 
-    ``stop`` is the force that brings the particle to rest within the step. At rest it is held by that, up to the static
-    limit. Otherwise it slides: the dynamic limit against the motion, but never more than what stops it.
+    ``stop`` is the force that brings the particle to rest within the step. Friction is that, as long as it is within
+    the static limit at rest, or the dynamic one in motion. Beyond, the particle slides, with the dynamic limit.
     """
     load = wp.abs(reaction)
     if colliders.applied_friction[c] == 1:
         load = wp.max(type(mass)(0.0), pressing)
     limit = colliders.dynamic_friction[c] * load
-    speed = wp.length(velocity)
-    friction = type(mass)(0.0) * velocity
-    if speed < type(mass)(REST_SPEED):
-        stop = -(applied + velocity * (mass / dt))
-        needed = wp.length(stop)
-        if needed <= colliders.static_friction[c] * load:
-            friction = stop
-        else:
-            friction = stop * (wp.min(limit, needed) / needed)
-    else:
-        friction = -velocity * (wp.min(limit, mass * speed / dt) / speed)
+    hold = limit
+    if wp.length(velocity) < type(mass)(REST_SPEED):
+        hold = colliders.static_friction[c] * load
+    stop = -(applied + velocity * (mass / dt))
+    needed = wp.length(stop)
+    friction = stop
+    if needed > hold:
+        friction = stop * (wp.min(limit, needed) / needed)
     return friction
 
 
@@ -303,6 +300,10 @@ def add_contact_forces(
     high = vectors.load(upper, chunk)
     now = step[0]
     at_start = now == wp.int64(0)
+    # In the first evaluation a contact of the step before still holds; later ones go by what the first one found.
+    latest = now
+    if not first:
+        latest = now + wp.int64(1)
     near = wp.uint32(0)
     for c in range(colliders.kind.shape[0]):
         if not culling or may_touch(colliders, c, body, low, high):
@@ -315,10 +316,11 @@ def add_contact_forces(
         point = vectors.load(x, i)
         start = vectors.load(x_start, i)
         total = type(dt)(0.0) * point
+        rubbing = type(dt)(0.0) * point
         touches = bool(False)
         for c in range(colliders.kind.shape[0]):
             if near & collider_bit(c) != wp.uint32(0):
-                held = held_contact(colliders, c, stamps, i, now)
+                held = held_contact(colliders, c, stamps, i, latest)
                 before = held_normal(colliders, c, normals, i)
                 normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, at_start)
                 if depth >= type(dt)(0.0):
@@ -331,16 +333,12 @@ def add_contact_forces(
                     applied = vectors.load(f, i)
                     pressing = -wp.dot(applied, normal)
                     reaction = normal_reaction(colliders, c, counted, speed, pressing)
-                    friction = friction_force(
-                        colliders,
-                        c,
-                        reaction,
-                        pressing,
-                        velocity - speed * normal,
-                        applied + pressing * normal,
-                        mass[i],
-                        dt,
-                    )
+                    # With what others rub already, so that all together do no more than stop the particle.
+                    rubbed_along = rubbing - wp.dot(rubbing, normal) * normal
+                    along = velocity - speed * normal
+                    pull = applied + pressing * normal + rubbed_along
+                    friction = friction_force(colliders, c, reaction, pressing, along, pull, mass[i], dt)
+                    rubbing += friction
                     total += reaction * normal + friction
                     damped -= wp.float64((reaction - colliders.stiffness[c] * counted) * speed)
                     rubbed -= wp.float64(wp.dot(friction, velocity))

@@ -15,6 +15,8 @@ from warpjelly.scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene
 
 EPSILON = {"float32": 2.0**-23, "float64": 2.0**-52}
 """Spacing of the numbers above 1: one operation is wrong by at most half of it."""
+REST_SPEED = 1e-4
+"""Slower than this along a surface, static friction may hold, m/s."""
 ROUND_OFF = {"float32": 1e-5, "float64": 1e-13}
 """Relative error of one evaluation of a law: some dozen operations, that is, 80 (450) epsilons."""
 
@@ -108,44 +110,101 @@ def elastic_energy(x: np.ndarray, ends: np.ndarray, rest: np.ndarray, k: np.ndar
     return float((0.5 * k * (length - rest) ** 2).sum())
 
 
-def find_contacts(collider: Any, point: np.ndarray, start: np.ndarray, up: int = 1) -> list[tuple[np.ndarray, float]]:
-    """Return (outward unit normal, depth >= 0) of each contact of a point; start is where its body's mass was."""
+@dataclass(frozen=True)
+class Touch:
+    """How each of n points touches one wall, plane or ball."""
+
+    normal: np.ndarray
+    """Outward unit normals, [n, 3]."""
+    depth: np.ndarray
+    """Depths along them, m, [n]; -1 without contact."""
+    counted: np.ndarray
+    """The part of the depths that the force grows with, m, [n]."""
+
+    @property
+    def here(self) -> np.ndarray:
+        """Whether there is contact, [n]."""
+        return self.depth >= 0
+
+
+def lengths(a: np.ndarray) -> np.ndarray:
+    """Return the lengths of the rows, [n]."""
+    return np.sqrt((a * a).sum(axis=1))
+
+
+def find_touches(
+    collider: Any,
+    x: np.ndarray,
+    origin: Any,
+    *,
+    before: np.ndarray | None = None,
+    earlier: list[Touch] | None = None,
+    anywhere: bool = True,
+    up: int = 1,
+) -> list[Touch]:
+    """Return how points touch a collider; six times for the six walls of a box.
+
+    Args:
+        collider: of the scene.
+        x: the points, [n, 3].
+        origin: where the centre of mass of the body of each point started, [3] or [n, 3].
+        before: where the points were one step earlier; the points themselves unless given.
+        earlier: what this returned one step earlier.
+        anywhere: whether a point near behind a plane touches it, wherever it comes from, as at time zero.
+        up: axis that points up.
+    """
+    before = x if before is None else before
     center = np.array(collider.center)
-    local = point - center
-    if isinstance(collider, SphereCollider):
-        distance = np.linalg.norm(local)
-        if distance > collider.radius:
-            return []
-        return [(local / distance if distance > 0 else np.eye(3)[up], collider.radius - distance)]
+    local, ago = x - center, before - center
     if isinstance(collider, BoxCollider):
-        walls = [
-            (-sign * np.eye(3)[axis], sign * local[axis] - collider.size[axis] / 2)
-            for axis, sign in itertools.product(range(3), (-1.0, 1.0))
-        ]
-        return [(normal, depth) for normal, depth in walls if depth >= 0]
-    normal = np.array(collider.normal) / np.linalg.norm(collider.normal)
+        walls = []
+        for axis, sign in itertools.product(range(3), (-1.0, 1.0)):
+            depth = sign * local[:, axis] - collider.size[axis] / 2
+            walls.append((np.tile(-sign * np.eye(3)[axis], (len(x), 1)), np.where(depth >= 0, depth, -1.0)))
+        return [Touch(normal, depth, depth) for normal, depth in walls]
+    held = np.zeros(len(x), bool) if earlier is None else earlier[0].here
+    if isinstance(collider, SphereCollider):
+        distance = lengths(local)
+        normal = np.tile(np.eye(3)[up], (len(x), 1))
+        normal[distance > 0] = local[distance > 0] / distance[distance > 0, None]
+        if collider.normal == "entry":
+            if earlier is not None:
+                normal[held] = earlier[0].normal[held]
+            # The line of the path passes the centre at its foot, and enters the ball by half a chord before that.
+            for i in np.flatnonzero(~held & (distance <= collider.radius) & (lengths(ago) > collider.radius)):
+                direction = (local[i] - ago[i]) / np.linalg.norm(local[i] - ago[i])
+                foot = ago[i] - (ago[i] @ direction) * direction
+                normal[i] = (foot - direction * np.sqrt(max(0.0, collider.radius**2 - foot @ foot))) / collider.radius
+        # The way out along n: |local + depth n| = radius.
+        along = (local * normal).sum(axis=1)
+        square = np.where(distance <= collider.radius, along**2 + collider.radius**2 - distance**2, 0.0)
+        depth = np.where(distance <= collider.radius, np.sqrt(np.maximum(square, 0.0)) - along, -1.0)
+        return [Touch(normal, depth, depth)]
+    n = np.array(collider.normal) / np.linalg.norm(collider.normal)
     if isinstance(collider, HalfSpaceCollider):
-        if (start - center) @ normal < 0:
-            normal = -normal
-        depth = -(local @ normal)
-        return [(normal, depth)] if depth >= 0 else []
+        sign = np.where((np.broadcast_to(origin, x.shape) - center) @ n < 0, -1.0, 1.0)
+        depth = -sign * (local @ n)
+        depth = np.where(depth >= 0, depth, -1.0)
+        return [Touch(sign[:, None] * n, depth, depth)]
     assert isinstance(collider, PlaneCollider)
     assert collider.tangent is not None, "the reference knows no default tangent"
-    tangent = np.array(collider.tangent) - normal * (normal @ collider.tangent)
+    tangent = np.array(collider.tangent) - n * (n @ collider.tangent)
     tangent /= np.linalg.norm(tangent)
-    inside = abs(local @ tangent) <= collider.size[0] / 2
-    inside &= abs(local @ np.cross(normal, tangent)) <= collider.size[1] / 2
-    depth = -(local @ normal)
-    return [(normal, depth)] if inside and 0 <= depth <= collider.threshold else []
+    bitangent = np.cross(n, tangent)
 
+    def over(points: np.ndarray) -> np.ndarray:
+        inside = abs(points @ tangent) <= collider.size[0] / 2
+        return inside & (abs(points @ bitangent) <= collider.size[1] / 2)
 
-def contact_force(collider: Any, point: np.ndarray, velocity: np.ndarray, start: np.ndarray, up: int = 1) -> np.ndarray:
-    """Sum max(0, k depth - d v.n) n, without the maximum where the collider pulls, over the contacts of a particle."""
-    force = np.zeros(3)
-    for normal, depth in find_contacts(collider, point, start, up):
-        push = collider.stiffness * depth - collider.damping * (velocity @ normal)
-        force += (push if collider.pulls else max(0.0, push)) * normal
-    return force
+    height, height_ago = local @ n, ago @ n
+    behind = (height <= 0) & over(local)
+    # Where the path meets the plane; a path within it has met it already.
+    fall = height_ago - height
+    share = np.where(fall > 0, height_ago / np.where(fall > 0, fall, 1.0), 0.0)
+    came_through = (height_ago >= 0) & over(ago + share[:, None] * (local - ago))
+    here = behind & (held | came_through | (anywhere & (height >= -collider.threshold)))
+    depth = np.where(here, -height, -1.0)
+    return [Touch(np.tile(n, (len(x), 1)), depth, np.minimum(depth, collider.threshold))]
 
 
 def grid_force(field: Any, points: np.ndarray) -> np.ndarray:
@@ -170,9 +229,55 @@ def field_force(field: Any, x: np.ndarray, v: np.ndarray, charge: np.ndarray, ti
     return factor * np.tile(field.force, (len(x), 1))
 
 
-def contact_energy(collider: Any, point: np.ndarray, start: np.ndarray, up: int = 1) -> float:
-    """Sum 1/2 k depth^2 over the contacts of a particle with a collider."""
-    return sum(0.5 * collider.stiffness * depth**2 for _, depth in find_contacts(collider, point, start, up))
+def contact_law(collider: Any, contact: Any) -> dict[str, Any]:
+    """Return what a collider does, by its own keys or else by the scene's."""
+    names = ("stiffness", "damping", "static_friction", "dynamic_friction", "pulls")
+    own = {name: getattr(collider, name) for name in names}
+    law = {name: getattr(contact, name) if value is None else value for name, value in own.items()}
+    return {**law, "term": contact.normal_force_term, "applied_friction": contact.friction_normal == "applied"}
+
+
+def contact_forces(
+    law: dict[str, Any], touch: Touch, v: np.ndarray, applied: np.ndarray, m: np.ndarray, dt: float, given: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the normal reactions and the frictions on particles, [n, 3] each.
+
+    Args:
+        law: of the collider.
+        touch: how they touch it.
+        v: velocities, [n, 3].
+        applied: all forces but the reactions of colliders, [n, 3].
+        m: masses, [n].
+        dt: the step.
+        given: friction that other colliders gave already, [n, 3].
+    """
+    reactions, frictions = np.zeros_like(v), np.zeros_like(v)
+    for i in np.flatnonzero(touch.here):
+        n = touch.normal[i]
+        push = law["stiffness"] * touch.counted[i] - law["damping"] * (v[i] @ n)
+        if not law["pulls"]:
+            push = max(push, 0.0)
+        pressing = -(applied[i] @ n)
+        if law["term"]:
+            push += max(pressing, 0.0)
+        reactions[i] = push * n
+        load = max(pressing, 0.0) if law["applied_friction"] else abs(push)
+        sliding, pulling = v[i] - (v[i] @ n) * n, applied[i] - (applied[i] @ n) * n
+        pulling = pulling + given[i] - (given[i] @ n) * n
+        stop = -(pulling + m[i] * sliding / dt)
+        needed = np.linalg.norm(stop)
+        resting = np.linalg.norm(sliding) < REST_SPEED
+        if needed > law["static_friction" if resting else "dynamic_friction"] * load:
+            stop *= min(1.0, law["dynamic_friction"] * load / needed)
+        frictions[i] = stop
+    return reactions, frictions
+
+
+def contact_energy(collider: Any, contact: Any, touch: Touch) -> float:
+    """Return 1/2 k depth^2, from a plane's threshold on growing as the force there times the rest of the way."""
+    k = contact_law(collider, contact)["stiffness"]
+    deep, counted = touch.depth[touch.here], touch.counted[touch.here]
+    return float((k * counted**2 / 2 + k * counted * (deep - counted)).sum())
 
 
 def rotation(degrees: Any) -> np.ndarray:
@@ -185,11 +290,15 @@ def rotation(degrees: Any) -> np.ndarray:
 
 
 class World:
-    """A scene of cubes and voxels in motion by semi-implicit Euler."""
+    """A scene of cubes and voxels in motion."""
 
     def __init__(self, scene: Scene) -> None:
         assert scene.solver.dt != "auto"
-        self.scene, self.dt = scene, 1 / (scene.fps * scene.substeps_for(scene.solver.dt))
+        self.scene, self.dt = scene, scene.dt_for(scene.substeps_for(scene.solver.dt))
+        self.laws = [contact_law(collider, scene.contact) for collider in scene.colliders]
+        self.steps = 0
+        self.losses = np.zeros(3)
+        """Taken by springs, by the damping of contacts and by friction, J."""
         self.keys: list[list[Key]] = []
         xs, vs, ms, bodies, springs, self.starts = [], [], [], [], [], []
         first = 0
@@ -227,24 +336,89 @@ class World:
         table = np.array(springs)
         self.ends = table[:, :2].astype(int)
         self.rest, self.k, self.d = table[:, 2:].T.copy()
+        self.origins = np.array(self.starts)[self.body]
+        self.before = self.x
+        """Positions at the start of the previous step."""
+        self.touches: list[list[Touch]] | None = None
+        """How the particles touched each collider at the start of the previous step."""
+
+    def find_touches(self, x: np.ndarray, before: np.ndarray, earlier: list[list[Touch]] | None) -> list[list[Touch]]:
+        """Return how the particles touch each collider."""
+        return [
+            find_touches(
+                collider,
+                x,
+                self.origins,
+                before=before,
+                earlier=None if earlier is None else earlier[number],
+                anywhere=self.steps == 0,
+                up=self.scene.up,
+            )
+            for number, collider in enumerate(self.scene.colliders)
+        ]
+
+    def evaluate(
+        self, x: np.ndarray, v: np.ndarray, touches: list[list[Touch]], share: float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return the total forces, a share of a step on, and what springs, contacts and friction take out, W [3]."""
+        elastic = spring_forces(x, v, self.ends, self.rest, self.k, 0 * self.d)
+        springs = spring_forces(x, v, self.ends, self.rest, self.k, self.d)
+        applied = self.m[:, None] * self.scene.gravity_vector + springs
+        charge = np.array([self.scene.bodies[body].charge for body in self.body])
+        for field in self.scene.fields:
+            applied = applied + field_force(field, x, v, charge, (self.steps + share) * self.dt)
+        given = np.zeros_like(x)
+        total, power = applied, np.array([-((springs - elastic) * v).sum(), 0.0, 0.0])
+        for law, of_collider in zip(self.laws, touches, strict=True):
+            for touch in of_collider:
+                if touch.here.any():
+                    reaction, friction = contact_forces(law, touch, v, applied, self.m, self.dt, given)
+                    stored = law["stiffness"] * np.where(touch.here, touch.counted, 0.0)[:, None] * touch.normal
+                    total, given = total + reaction + friction, given + friction
+                    power -= [0.0, ((reaction - stored) * v).sum(), (friction * v).sum()]
+        return total, power
 
     def forces(self) -> np.ndarray:
         """Return the total forces at the current state."""
-        f = self.m[:, None] * self.scene.gravity_vector
-        f += spring_forces(self.x, self.v, self.ends, self.rest, self.k, self.d)
-        for collider, (i, body) in itertools.product(self.scene.colliders, enumerate(self.body)):
-            f[i] += contact_force(collider, self.x[i], self.v[i], self.starts[body], self.scene.up)
-        charge = np.array([self.scene.bodies[body].charge for body in self.body])
-        for field in self.scene.fields:
-            f += field_force(field, self.x, self.v, charge, self.steps * self.dt)
-        return f
+        return self.evaluate(self.x, self.v, self.find_touches(self.x, self.before, self.touches))[0]
 
     def step(self, count: int = 1) -> None:
-        """Advance: v += dt f / m, then x += dt v."""
+        """Advance by the scheme of the scene."""
         for _ in range(count):
-            self.v = self.v + self.dt * self.forces() / self.m[:, None]
-            self.x = self.x + self.dt * self.v
-            self.steps += 1
+            self._step()
+
+    def _step(self) -> None:
+        x, v, h = self.x, self.v, self.dt
+        # The first evaluation of a step looks one step back and is remembered; later ones look back to its start.
+        now = self.find_touches(x, self.before, self.touches)
+
+        def rate(share: float, dx: np.ndarray, dv: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+            f, power = self.evaluate(x + dx, v + dv, self.find_touches(x + dx, x, now), share)
+            return v + dv, f / self.m[:, None], power
+
+        f, power = self.evaluate(x, v, now)
+        a = f / self.m[:, None]
+        match self.scene.solver.integrator:
+            case "explicit_euler":
+                self.x, self.v = x + h * v, v + h * a
+            case "semi_implicit_euler":
+                self.v = v + h * a
+                self.x = x + h * self.v
+            case "rk2":
+                # y + h f(y + h/2 f(y))
+                u, a, power = rate(0.5, h / 2 * v, h / 2 * a)
+                self.x, self.v = x + h * u, v + h * a
+            case "rk4":
+                # y + h/6 (k1 + 2 k2 + 2 k3 + k4)
+                u2, a2, power2 = rate(0.5, h / 2 * v, h / 2 * a)
+                u3, a3, power3 = rate(0.5, h / 2 * u2, h / 2 * a2)
+                u4, a4, power4 = rate(1.0, h * u3, h * a3)
+                self.x = x + h / 6 * (v + 2 * u2 + 2 * u3 + u4)
+                self.v = v + h / 6 * (a + 2 * a2 + 2 * a3 + a4)
+                power = (power + 2 * power2 + 2 * power3 + power4) / 6
+        self.losses += h * power
+        self.before, self.touches = x, now
+        self.steps += 1
 
     def top_frequency(self) -> float:
         """Return the largest angular frequency of the springs at rest, rad/s: the root of the top of M^-1 K."""

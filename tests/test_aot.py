@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import itertools
 import json
 import pkgutil
 import subprocess
@@ -31,9 +32,12 @@ def launch_everything() -> None:
         {"type": "sphere", "radius": 1.0},
         {"type": "box", "size": [1.0, 1.0, 1.0]},
     ]
-    parts = {"colliders": colliders, "fields": [{"type": "constant", "force": [0.0, 0.0, 0.0]}]}
-    for precision in ("float32", "float64"):
-        simulator = Simulator(make_scene(**parts, solver={"precision": precision}), device="cpu")
+    cube = {"type": "cube", "material": "jelly", "particles_per_edge": 2}
+    bodies = [cube, {**cube, "position": [3.0, 0.0, 0.0]}]
+    parts = {"bodies": bodies, "colliders": colliders, "fields": [{"type": "constant", "force": [0.0, 0.0, 0.0]}]}
+    for precision, integrator in itertools.product(("float32", "float64"), ("rk4", "semi_implicit_euler")):
+        solver = {"precision": precision, "integrator": integrator}
+        simulator = Simulator(make_scene(**parts, solver=solver), device="cpu")
         simulator.step()
         simulator.first_lost()
         simulator.diagnostics()
@@ -43,8 +47,8 @@ def launch_everything() -> None:
         wp.launch(
             springs.add_spring_forces,
             dim=(len(model.spans), springs.MAX_SPAN),
-            inputs=[model.spans, model.spring_classes, state.x, state.v],
-            outputs=[state.f],
+            inputs=[model.spans, model.spring_classes, state.x, state.v, model.real(0.0)],
+            outputs=[state.f, state.spring_losses],
             device="cpu",
         )
     voxelize(np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]), 2, device="cpu")

@@ -185,7 +185,7 @@ def test_an_unforeseen_failure_keeps_the_frames(warpjelly, tmp_path, monkeypatch
     advance = wj.Simulator.advance_frame
 
     def fail(sim: wj.Simulator) -> None:
-        if sim.substep_count >= 3 * sim.scene.substeps:
+        if sim.substep_count >= 3 * sim.substeps:
             raise RuntimeError("device lost")
         advance(sim)
 

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 import reference
-import warp as wp
+from probes import probe, push, push_fully
 from reference import EPSILON, ROUND_OFF, World
 from worlds import make_material, make_scene, make_voxels, set_state
 
-from warpjelly.kernels import bounds, contacts
 from warpjelly.scene import Scene
 from warpjelly.simulator import Simulator
 
@@ -44,57 +43,9 @@ def make_simulator(
     return Simulator(scene, device=device)
 
 
-@wp.kernel(enable_backward=False)
-def find_contacts(
-    colliders: Any,
-    points: wp.array(dtype=Any),
-    normals: wp.array2d(dtype=Any),
-    depths: wp.array2d(dtype=Any),
-):
-    """Overwrite normals and depths [point, collider] as seen from body 0."""
-    i, c = wp.tid()
-    normal, depth = contacts.contact_normal_and_depth(colliders, c, 0, points[i])
-    normals[i, c] = normal
-    depths[i, c] = depth
-
-
-def probe(simulator: Simulator, points: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return normals and depths [point, wall] of points in the only collider, which is six walls if it is a box."""
-    model, device = simulator.model, simulator.device
-    vector = wp.types.vector(3, model.real)
-    shape = (len(points), len(model.colliders.kind))
-    normals = wp.array(np.full((*shape, 3), np.nan), dtype=vector, device=device)
-    depths = wp.array(np.full(shape, np.nan), dtype=model.real, device=device)
-    inputs = [model.colliders, wp.array(np.array(points, float), dtype=vector, device=device)]
-    wp.launch(find_contacts, dim=shape, inputs=inputs, outputs=[normals, depths], device=device)
-    return normals.numpy().astype(float), depths.numpy().astype(float)
-
-
-def push(
-    simulator: Simulator,
-    x: np.ndarray,
-    v: np.ndarray,
-    *,
-    culling: bool,
-    before: np.ndarray | None = None,
-    size: int = 1,
-) -> np.ndarray:
-    """Return the forces [count, 3] after contact has been added to those before, in chunks of some size."""
-    model, device, count = simulator.model, simulator.device, len(x) // size
-    before = np.zeros_like(x) if before is None else before
-    rows = [wp.array(np.ascontiguousarray(a.T), dtype=model.real, device=device) for a in (x, v, before)]
-    lower, upper = (wp.array(np.full((3, count), np.nan), dtype=model.real, device=device) for _ in range(2))
-    start = wp.array(size * np.arange(count + 1), dtype=wp.int32, device=device)
-    body = wp.zeros(count, dtype=wp.int32, device=device)
-    wp.launch(bounds.update_chunk_bounds, dim=count, inputs=[start, rows[0]], outputs=[lower, upper], device=device)
-    wp.launch(
-        contacts.add_contact_forces,
-        dim=(count, 1),
-        inputs=[start, body, model.colliders, lower, upper, *rows[:2], culling, 1],
-        outputs=[rows[2]],
-        device=device,
-    )
-    return rows[2].numpy().T
+def touch_any(shape: Any, x: np.ndarray, origin: Any = START) -> np.ndarray:
+    """Return whether points touch a collider, [count]."""
+    return np.any([touch.here for touch in reference.find_touches(shape, x, origin)], axis=0)
 
 
 def draw_points(count: int, precision: str, seed: int = 0) -> np.ndarray:
@@ -104,14 +55,15 @@ def draw_points(count: int, precision: str, seed: int = 0) -> np.ndarray:
 
 def draw_in_contact(scene: Scene, count: int, precision: str) -> np.ndarray:
     """Return points well inside the only collider of a scene, where a small step does not change its contacts."""
-    found = []
-    for point in draw_points(40 * count, precision, 1):
-        around = [point, *(point + s * 1e-3 * axis for s in (-1, 1) for axis in np.eye(3))]
-        sets = [reference.find_contacts(scene.colliders[0], p, np.array(START)) for p in around]
-        if sets[0] and all(len(s) == len(sets[0]) for s in sets):
-            found.append(point)
+    points = draw_points(40 * count, precision, 1)
+    shifts = [np.zeros(3), *(s * 1e-3 * axis for s in (-1, 1) for axis in np.eye(3))]
+    counts = [
+        np.sum([touch.here for touch in reference.find_touches(scene.colliders[0], points + shift, START)], axis=0)
+        for shift in shifts
+    ]
+    found = points[(counts[0] > 0) & (np.ptp(counts, axis=0) == 0)]
     assert len(found) >= count
-    return np.array(found[:count])
+    return found[:count]
 
 
 POINTS = {
@@ -183,7 +135,7 @@ def test_contacts_at_known_points(name: str, precision: str, device: str) -> Non
     simulator = make_simulator(collider, precision, device, start)
     assert simulator.model.colliders.side.numpy().tolist() == [[-1.0 if "behind" in name else 1.0]]
     points = [point for point, _ in cases]
-    normals, depths = probe(simulator, points)
+    normals, depths, _ = probe(simulator, points)
     for point, expected, normal, depth in zip(points, [e for _, e in cases], normals[:, 0], depths[:, 0], strict=True):
         if expected is None:
             assert depth < 0, point
@@ -206,7 +158,7 @@ def test_box_is_one_contact_for_each_violated_wall(precision: str, device: str) 
             (1.0, 64.0, 3.5): {(0, -1, 0): 62.0, (0, 0, -1): 0.5},
             (-1.0, -3.0, -4.0): {(1, 0, 0): 1.0, (0, 1, 0): 1.0, (0, 0, 1): 1.0},
         }
-        normals, depths = probe(simulator, list(cases))
+        normals, depths, _ = probe(simulator, list(cases))
         for expected, normal, depth in zip(cases.values(), normals, depths, strict=True):
             touched = depth >= 0
             found = {tuple(n): d for n, d in zip(normal[touched].tolist(), depth[touched].tolist(), strict=True)}
@@ -233,9 +185,12 @@ def test_force_matches_the_reference(kind: str, precision: str, device: str) -> 
     x, v, before = (draw_points(1000, precision, seed) for seed in range(3))
     found = push(simulator, x, v, culling=False, before=before)
     shape = simulator.scene.colliders[0]
-    expected = np.array([reference.contact_force(shape, *xv, np.array(START)) for xv in zip(x, v, strict=True)])
+    law = reference.contact_law(shape, simulator.scene.contact)
+    expected = np.zeros_like(x)
+    for touch in reference.find_touches(shape, x, START):
+        expected += reference.contact_forces(law, touch, v, before, np.full(1000, 0.01), simulator.dt)[0]
     # Every case occurs: outside, pushed, and in contact but leaving too fast to be pushed.
-    touched = np.array([bool(reference.find_contacts(shape, p, np.array(START))) for p in x])
+    touched = touch_any(shape, x)
     assert 100 <= touched.sum() <= 960
     assert (touched & ~expected.any(axis=1)).sum() >= 5
     # Lengths and speeds of up to 4 in each of up to three contacts.
@@ -277,9 +232,10 @@ def test_contact_never_pulls_and_damping_opposes_approach(kind: str, precision: 
     shape = simulator.scene.colliders[0]
     x = draw_in_contact(simulator.scene, 8, precision)
     if kind == "box":
-        x = np.array([p for p in x if len(reference.find_contacts(shape, p, np.array(START))) == 1])
-    normal, depth = zip(*[reference.find_contacts(shape, p, np.array(START))[0] for p in x], strict=True)
-    normal, depth = np.array(normal), np.array(depth)
+        x = x[np.sum([touch.here for touch in reference.find_touches(shape, x, START)], axis=0) == 1]
+    touches = reference.find_touches(shape, x, START)
+    normal = sum(touch.here[:, None] * touch.normal for touch in touches)
+    depth = sum(np.where(touch.here, touch.depth, 0.0) for touch in touches)
 
     def pushed(speed: np.ndarray) -> np.ndarray:
         return (push(simulator, x, speed[:, None] * normal, culling=True) * normal).sum(axis=1)
@@ -404,16 +360,17 @@ def test_culling_keeps_contacts_within_round_off_of_the_border(
     )  # fmt: skip
     # From inside to outside on many lines, a bisection finds the border; then there are the last bits around it.
     shape, start = simulator.scene.colliders[0], START + offset
-    points = []
-    for a, b in rng.uniform(-1.2, 1.2, (300, 2, 3)) + offset:
-        touches = [bool(reference.find_contacts(shape, p, start)) for p in (a, b)]
-        if touches[0] == touches[1]:
-            continue
-        inside, outside = (a, b) if touches[0] else (b, a)
-        for _ in range(60):
-            middle = (inside + outside) / 2
-            inside, outside = (middle, outside) if reference.find_contacts(shape, middle, start) else (inside, middle)
-        points += [inside + step * np.spacing(np.abs(inside).astype(precision)) for step in rng.integers(-3, 4, (9, 3))]
+    a, b = np.moveaxis(rng.uniform(-1.2, 1.2, (300, 2, 3)) + offset, 1, 0)
+    touches = touch_any(shape, a, start)
+    differ = touches != touch_any(shape, b, start)
+    inside, outside = np.where(touches[:, None], a, b)[differ], np.where(touches[:, None], b, a)[differ]
+    for _ in range(60):
+        middle = (inside + outside) / 2
+        touches = touch_any(shape, middle, start)[:, None]
+        inside, outside = np.where(touches, middle, inside), np.where(touches, outside, middle)
+    points = [
+        p + step * np.spacing(np.abs(p).astype(precision)) for p in inside for step in rng.integers(-3, 4, (9, 3))
+    ]
     # The extremes of round and turned solids, where their boxes are tight.
     center = np.array(shape.center)
     extremes = []
@@ -441,7 +398,7 @@ def test_culling_keeps_contacts_within_round_off_of_the_border(
     both = [push(simulator, pairs, speeds, culling=culling, size=2) for culling in (True, False)]
     assert both[0].tobytes() == both[1].tobytes()
     np.testing.assert_array_equal(both[1][::2], full)
-    _, depths = probe(simulator, x)
+    _, depths, _ = probe(simulator, x)
     touching = (depths >= 0).any(axis=1)
     np.testing.assert_array_equal(full.any(axis=1), touching)
     assert touching.sum() > 100
@@ -522,3 +479,337 @@ def test_momentum_is_untouched_without_contact(precision: str) -> None:
         assert near.state.x.numpy().tobytes() == alone.state.x.numpy().tobytes()
         assert near.state.v.numpy().tobytes() == alone.state.v.numpy().tobytes()
         assert near.diagnostics()["contacts"] == 0
+
+
+INTEGRATORS = ["explicit_euler", "semi_implicit_euler", "rk2", "rk4"]
+# A table of 2 m by 2 m at y = 0, 0.1 m thick, that faces up.
+TABLE = {"type": "plane", "normal": [0.0, 1.0, 0.0], "tangent": [1.0, 0.0, 0.0], "size": [2.0, 2.0],
+         "threshold": 0.1, **PENALTY}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", COLLIDERS)
+def test_lanes_do_not_matter(kind: str, precision: str, device: str) -> None:
+    """Give the same bits whether one thread does a chunk or 32 lanes share it, also where they do not divide it."""
+    simulator = make_simulator(COLLIDERS[kind], precision, device)
+    x, v, before = (draw_points(3 * 77, precision, seed) for seed in range(3))
+    alone, shared = (push_fully(simulator, x, v, before=before, size=77, lanes=lanes) for lanes in (1, 32))
+    assert alone.forces.tobytes() == shared.forces.tobytes()
+    assert alone.stamps.tobytes() == shared.stamps.tobytes()
+    assert (alone.forces != before.astype(precision)).any()
+    # Sums over the lanes come in any order.
+    np.testing.assert_allclose(alone.losses, shared.losses, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", COLLIDERS)
+def test_culling_leaves_out_boxes_that_are_clear(kind: str, precision: str, device: str) -> None:
+    """Trust the boxes of chunks: particles in contact get no force where their box is said to be far away."""
+    # A room is clear in its middle, and what lies at the origin or faces +x +y +z is clear of a box far out there.
+    collider = COLLIDERS[kind] | ({"normal": [1.0, 2.0, 2.0]} if "normal" in COLLIDERS[kind] else {})
+    simulator = make_simulator(collider, precision, device, [1.0, 2.0, 2.0])
+    clear = (0.05, 0.1) if kind == "box" else (50.0, 51.0)
+    points = draw_points(400, precision, 1)
+    x = points[touch_any(simulator.scene.colliders[0], points, [1.0, 2.0, 2.0])]
+    assert len(x) > 10
+    culled = push_fully(simulator, x, 0 * x, culling=True, box=clear)
+    np.testing.assert_array_equal(culled.forces, 0)
+    np.testing.assert_array_equal(culled.stamps, -2)
+    assert push_fully(simulator, x, 0 * x, culling=False, box=clear).forces.any(axis=1).all()
+
+
+def throw(
+    collider: dict[str, Any],
+    velocity: Any,
+    position: Any,
+    device: str,
+    *,
+    gravity: Any = (0.0, 0.0, 0.0),
+    contact: dict[str, Any] | None = None,
+    **solver: Any,
+) -> Simulator:
+    """Return a simulator of 8 particles without springs, on the corners of a cube of 0.1 m."""
+    body = {"type": "cube", "material": "jelly", "particles_per_edge": 2, "size": 0.1, "position": list(position),
+            "velocity": list(velocity)}  # fmt: skip
+    scene = make_scene(
+        bodies=[body], colliders=[collider], materials={"jelly": make_material(0.0, 0.0)}, gravity=list(gravity),
+        solver=solver, **({} if contact is None else {"contact": contact}),
+    )  # fmt: skip
+    return Simulator(scene, device=device)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("speed", [1.0, 30.0, 1000.0])
+def test_fast_particles_do_not_get_through_a_plane(integrator: str, speed: float, device: str) -> None:
+    """Catch particles that pass a plane of 0.1 m at up to 1000 m/s, 1 m within a step, and send them back."""
+    collider = TABLE | {"stiffness": 2e4, "damping": 0.0, "threshold": 0.5}
+    simulator = throw(collider, [0.3, -speed, 0.1], [0.1, 0.45, 0.05], device, integrator=integrator)
+    # It takes 0.5 m / speed to get there. At 1000 m/s it ends 0.5 m or more behind and has to be brought back by
+    # 1e4 N / 0.01 kg = 1e6 m/s^2: 2 ms. That of the slow ones takes half a period, pi/sqrt(2e4/0.01) = 2 ms.
+    simulator.step(700 if speed < 10 else 30)
+    assert (simulator.velocities[:, 1] > 0).all()
+    # Along the surface nothing happens.
+    np.testing.assert_allclose(simulator.velocities[:, [0, 2]], np.tile([0.3, 0.1], (8, 1)), rtol=1e-12)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_flight_under_a_plane_is_free(integrator: str, device: str) -> None:
+    """Leave alone what flies sideways or up from under a plane, inside its threshold: no force, no energy."""
+    for velocity, position in (([4.0, 0.0, 0.0], [-1.2, -0.055, 0.0]), ([0.5, 2.0, 0.0], [0.2, -0.5, 0.0])):
+        simulator = throw(TABLE, velocity, position, device, integrator=integrator)
+        start = simulator.positions
+        kinetic, n = simulator.diagnostics()["kinetic"], 500
+        for _ in range(n // 10):
+            simulator.step(10)
+            measured = simulator.diagnostics()
+            assert measured["contacts"] == measured["contact"] == 0
+            assert measured["kinetic"] == kinetic
+        # v n dt, rounded at each of n steps.
+        expected = start + np.array(velocity) * n * simulator.dt
+        np.testing.assert_allclose(simulator.positions, expected, rtol=0, atol=4 * n * EPSILON["float64"])
+
+
+def test_springy_cube_under_a_plane_gains_no_energy(device: str) -> None:
+    """Fly a vibrating cube sideways under a plane and up against its back: its energy stays what it was."""
+    body = {"type": "cube", "material": "jelly", "particles_per_edge": 3, "size": 0.3, "position": [-1.5, -0.25, 0.0],
+            "velocity": [4.0, 0.5, 0.0], "angular_velocity": [1.0, 2.0, 3.0]}  # fmt: skip
+    alone, beside = (
+        Simulator(
+            make_scene(bodies=[body], colliders=colliders, materials={"jelly": make_material(30.0, 0.05)}),
+            device=device,
+        )
+        for colliders in ([], [TABLE])
+    )
+    for simulator in (alone, beside):
+        simulator.step(1000)
+    # As without the plane, in every bit. From 0.1 m below it rose by 0.5 m, and crossed 3 m of it meanwhile.
+    np.testing.assert_array_equal(alone.positions, beside.positions)
+    assert alone.positions[:, 1].min() > 0
+    assert beside.diagnostics()["contacts"] == 0
+
+
+def test_force_ends_at_the_threshold_and_contact_does_not(precision: str, device: str) -> None:
+    """Push a particle that was in contact one step earlier with the force of the threshold, however deep it is."""
+    simulator = make_simulator(TABLE | {"damping": 0.0}, precision, device, [0.0, 1.0, 0.0])
+    x = np.array([[0.0, -0.0625, 0.0], [0.0, -0.5, 0.0], [0.5, -64.0, 0.5], [1.25, -0.0625, 0.0], [0.0, 0.5, 0.0]])
+    held, ago = (
+        push_fully(simulator, x, 0 * x, step=7, stamps=np.full((1, 5), stamp), culling=culling)
+        for stamp, culling in ((6, True), (5, False))
+    )
+    # k min(depth, threshold); nothing beyond the rectangle or in front.
+    bound = ROUND_OFF[precision] * 200.0
+    np.testing.assert_allclose(held.forces[:, 1], [125.0, 200.0, 200.0, 0.0, 0.0], rtol=0, atol=bound)
+    assert held.stamps.tolist() == [[7, 7, 7, 6, 6]]
+    # Two steps ago is over: they are now behind without having come through.
+    np.testing.assert_array_equal(ago.forces, 0)
+    assert ago.stamps.tolist() == [[5] * 5]
+    # At time zero, those within the threshold are in contact, wherever they come from.
+    start = push_fully(simulator, x, 0 * x)
+    assert (start.stamps == 0).tolist() == [[True, False, False, False, False]]
+    # Energy grows on by k threshold for each metre: 1/2 k 0.1^2 + k 0.1 (0.5 - 0.1).
+    set_state(simulator, x=np.tile([0.0, 5.0, 0.0], (8, 1)))
+    simulator.state.stamps.fill_(-1)
+    simulator.state.x.assign(np.tile([[0.0], [-0.5], [0.0]], (1, 8)))
+    stored = simulator.diagnostics()
+    assert stored["contact"] == pytest.approx(8 * (10.0 + 80.0), rel=ROUND_OFF[precision])
+    assert stored["penetrations"].max() == pytest.approx(0.5, rel=ROUND_OFF[precision])
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_body_too_heavy_for_a_plane_falls_through(integrator: str, device: str) -> None:
+    """Sink into a plane that carries k threshold = 2 N with 5 N, and go on behind it with what is left of gravity."""
+    collider = TABLE | {"stiffness": 20.0, "damping": 0.0}
+    simulator = throw(
+        collider, [0.0, 0.0, 0.0], [0.0, 0.05, 0.0], device, gravity=[0.0, -500.0, 0.0], integrator=integrator
+    )
+    simulator.step(200)
+    assert (simulator.positions[:, 1] < -1.0).all()
+    assert simulator.diagnostics()["contacts"] == 8
+    before = simulator.velocities[:, 1]
+    simulator.step(100)
+    # a = -g + k threshold / m, constant, for 0.1 s, with rounding of speeds of up to 100 m/s.
+    change = (-500.0 + 20.0 * 0.1 / 0.01) * 0.1
+    np.testing.assert_allclose(simulator.velocities[:, 1] - before, change, rtol=1e-12)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_contact_ends_beyond_the_rectangle(integrator: str, device: str) -> None:
+    """Let go of a particle that slides off a plane, and leave it alone when it comes back under it."""
+    collider = TABLE | {"stiffness": 20.0}
+    simulator = throw(
+        collider, [5.0, 0.0, 0.0], [0.5, 0.05 - 1e-9, 0.0], device, gravity=[0.0, -9.81, 0.0], integrator=integrator
+    )
+    simulator.step(50)
+    assert simulator.diagnostics()["contacts"] == 4
+    simulator.step(150)
+    # All are beyond x = 1 and fall.
+    assert (simulator.positions[:, 0] > 1.2).all()
+    assert simulator.diagnostics()["contacts"] == 0
+    v = simulator.velocities
+    below = np.where(simulator.positions[:, 1] < 0)[0]
+    assert len(below) >= 4
+    simulator.state.v.assign(np.ascontiguousarray((v * [-1, 0, 1]).T))
+    seen = 0
+    for _ in range(10):
+        simulator.step(10)
+        under = simulator.positions[below]
+        seen += ((np.abs(under[:, 0]) < 1) & (under[:, 1] < 0)).sum()
+        assert (simulator.velocities[below, 1] < 0).all()
+    assert seen > 0
+
+
+def test_contact_that_ended_in_this_step_does_not_hold_in_its_later_stages(precision: str, device: str) -> None:
+    """Judge the later stages of a step by the first one, not by the step before: what left is not in contact any more.
+
+    Beyond the rectangle at the start of the step, a trial position behind it is free; outside the ball, one inside it
+    has a new entry.
+    """
+    simulator = make_simulator(TABLE, precision, device, [0.0, 1.0, 0.0])
+    start, x = np.array([[1.25, -0.0625, 0.0]]), np.array([[0.75, -0.0625, 0.0]])
+    # In contact in step 6, but not in the first evaluation of step 7.
+    later = push_fully(simulator, x, 0 * x, start=start, step=7, first=False, stamps=np.full((1, 1), 6))
+    np.testing.assert_array_equal(later.forces, 0)
+    ball = {"type": "sphere", "radius": 1.0, "normal": "entry", "stiffness": 64.0, "damping": 0.0}
+    simulator = make_simulator(ball, precision, device, [0.0, 3.0, 0.0])
+    start, x = np.array([[2.0, 0.0, 0.0]]), np.array([[0.5, 0.0, 0.0]])
+    normals = np.array([[0.0], [1.0], [0.0]])
+    later = push_fully(
+        simulator, x, 0 * x, start=start, step=7, first=False, stamps=np.full((1, 1), 6), normals=normals
+    )
+    np.testing.assert_allclose(later.forces, [[32.0, 0.0, 0.0]], atol=32 * ROUND_OFF[precision])
+
+
+def test_later_stages_remember_nothing(precision: str, device: str) -> None:
+    """Remember contacts in the first evaluation of a step only."""
+    simulator = make_simulator(TABLE, precision, device, [0.0, 1.0, 0.0])
+    x, start = np.array([[0.0, -0.0625, 0.0]]), np.array([[0.0, 0.5, 0.0]])
+    for first in (True, False):
+        pushed = push_fully(simulator, x, 0 * x, start=start, step=7, first=first)
+        assert pushed.forces[0, 1] > 0
+        assert pushed.stamps.tolist() == [[7 if first else -2]]
+
+
+def test_entry_normal_is_where_the_path_enters_and_stays(precision: str, device: str) -> None:
+    """Push back to where a path came into a ball, by the depth along that normal, for as long as contact lasts."""
+    ball = {"type": "sphere", "center": [1.0, 0.0, 0.0], "radius": 2.0, "normal": "entry", "stiffness": 64.0,
+            "damping": 0.0}  # fmt: skip
+    simulator = make_simulator(ball, precision, device, [1.0, 5.0, 0.0])
+    close = 64 * 4 * ROUND_OFF[precision]
+    # Down the line z = 1.2 of the ball: it enters at y = 1.6, so n = (0, 0.8, 0.6), and from (0, 0.6, 1.2), which is
+    # 0.8 x 0.6 + 0.6 x 1.2 = 1.2 along n and 0.6 x 0.6 - 0.8 x 1.2 = -0.6 across, it is (4 - 0.36)^0.5 - 1.2 out.
+    start, x = np.array([[1.0, 3.6, 1.2]]), np.array([[1.0, 0.6, 1.2]])
+    pushed = push_fully(simulator, x, 0 * x, start=start, step=3)
+    normal, depth = np.array([0.0, 0.8, 0.6]), (4 - 0.36) ** 0.5 - 1.2
+    np.testing.assert_allclose(pushed.forces[0], 64.0 * depth * normal, rtol=0, atol=close)
+    np.testing.assert_allclose(pushed.normals[:, 0], normal, rtol=0, atol=close)
+    assert pushed.stamps.tolist() == [[3]]
+    # One step later it is elsewhere, with the same normal; through the centre, too.
+    for step, point in enumerate(([2.0, 0.0, 0.0], [1.0, 0.0, 0.0], [1.0, -0.8, 1.2]), start=4):
+        x, start = np.array([point]), x
+        pushed = push_fully(simulator, x, 0 * x, start=start, step=step, stamps=pushed.stamps, normals=pushed.normals)
+        local = np.array(point) - [1, 0, 0]
+        along = local @ normal
+        depth = (along**2 + 4 - local @ local) ** 0.5 - along
+        np.testing.assert_allclose(pushed.forces[0], 64.0 * depth * normal, rtol=0, atol=2 * close)
+        # It leads to the surface.
+        assert np.linalg.norm(local + depth * normal) == pytest.approx(2.0, rel=1e-12)
+    # Once it was out, and for who starts inside, the normal is another: here radial.
+    pushed = push_fully(simulator, x, 0 * x, step=9, stamps=pushed.stamps, normals=pushed.normals)
+    local = x[0] - [1, 0, 0]
+    radial = local / np.linalg.norm(local)
+    np.testing.assert_allclose(pushed.forces[0], 64.0 * (2 * radial - local), rtol=0, atol=close)
+
+
+FLIGHT_OPTIONS = {"static_friction": 0.6, "dynamic_friction": 0.4}
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_culling_does_not_change_a_bit_with_friction(integrator: str, precision: str) -> None:
+    """Simulate the same bits with and without bounding boxes, with friction and memory, by every scheme."""
+    data = make_flight("all", precision, culling=True).scene.model_dump(exclude_none=True)
+    data["contact"] |= FLIGHT_OPTIONS
+    entry = next(collider for collider in data["colliders"] if collider["type"] == "sphere")
+    entry["normal"] = "entry"
+    data["solver"] |= {"integrator": integrator, "dt": 5e-4}
+    simulators = []
+    for culling in (True, False):
+        data["solver"]["culling"] = culling
+        simulators.append(Simulator(Scene.model_validate(data), device="cpu"))
+    seen = 0
+    for _ in range(10):
+        for simulator in simulators:
+            simulator.step(80)
+        culled, full = simulators
+        for name in ("x", "v", "f", "contact_losses"):
+            assert getattr(culled.state, name).numpy().tobytes() == getattr(full.state, name).numpy().tobytes(), name
+        seen += full.diagnostics()["contacts"]
+    assert seen > 0
+    assert np.isfinite(full.positions).all()
+    assert full.diagnostics()["friction_losses"] > 0
+
+
+@pytest.mark.parametrize("kind", COLLIDERS)
+def test_thrown_particles_gain_no_energy(kind: str, device: str) -> None:
+    """Throw particles at every kind of collider at random, with the defaults for contact: none gets faster."""
+    rng = np.random.default_rng(21)
+    # The body starts where a half-space keeps it; then the particles are put around the collider.
+    collider = {key: value for key, value in COLLIDERS[kind].items() if key not in PENALTY}
+    dt, k, d, m = 5e-4, 2000.0, 1.0, 0.01
+    for speed in (0.3, 3.0, 30.0):
+        simulator = throw(collider, [0.0, 0.0, 0.0], START, device, contact={}, dt=dt)
+        center = np.array(COLLIDERS[kind]["center"])
+        aim = center + rng.uniform(-0.2, 0.2, (8, 3))
+        outward = rng.normal(size=(8, 3)) + 2 * np.array([1, 2, -2]) / 3
+        outward /= np.linalg.norm(outward, axis=1)[:, None]
+        if kind in ("half_space", "plane"):
+            n = np.array([1, 2, -2]) / 3
+            outward += np.maximum(0.0, 0.2 - outward @ n)[:, None] * n
+            outward /= np.linalg.norm(outward, axis=1)[:, None]
+        x = aim if kind == "box" else center + 1.5 * outward
+        v = speed * (outward if kind == "box" else (aim - x) / np.linalg.norm(aim - x, axis=1)[:, None])
+        set_state(simulator, x=x, v=v)
+        start, greatest, seen = simulator.diagnostics()["kinetic"], 0.0, 0
+        for _ in range(100):
+            simulator.step(max(1, round(0.08 / speed / dt)))
+            measured = simulator.diagnostics()
+            greatest = max(greatest, measured["kinetic"] + measured["contact"])
+            seen += measured["contacts"]
+        # Semi-implicit Euler keeps H + dt/2 v.F, so H swings by w dt/2, w^2 = k/m, in each of up to three walls; and
+        # damping only makes it less: d dt/m = 0.05.
+        assert d * dt / m < 1
+        bound = 1 + (k / m) ** 0.5 * dt / 2 * 1.1
+        assert greatest <= bound * start
+        # In flight there is no swing: none leaves faster than it came.
+        after = np.linalg.norm(simulator.velocities, axis=1)
+        assert simulator.diagnostics()["contacts"] == 0 or kind == "box"
+        if kind != "box":
+            assert (after <= speed * (1 + 1e-12)).all()
+            assert (after < 0.99 * speed).sum() >= 4
+        assert simulator.diagnostics()["kinetic"] < start
+
+
+@pytest.mark.parametrize("mass", [0.002, 0.01, 1.0])
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_bounce_at_the_default_step_is_no_gain(integrator: str, mass: float, device: str) -> None:
+    """Throw many particles at a wall with nothing but defaults: whenever they arrive within a step, none gets faster.
+
+    A first depth of up to v dt comes for free. Explicit Euler adds energy while it bounces once k dt > d, which is its
+    largest stable step in contact; that is below the default step, and runs warn of it, so it takes a shorter one.
+    """
+    rng = np.random.default_rng(13)
+    body = {"type": "cube", "material": "jelly", "particles_per_edge": 5, "size": 0.5, "position": [0.0, 1.0, 0.0]}
+    data = make_scene(
+        bodies=[body], colliders=[{"type": "half_space", "normal": [0.0, 1.0, 0.0]}], contact={},
+        materials={"jelly": make_material(0.0, 0.0, particle_mass=mass)},
+    ).model_dump(exclude_none=True)  # fmt: skip
+    # The step is the default, too, but for explicit Euler: 0.9 of d / k = 0.5 ms.
+    data["solver"] = {"integrator": integrator, "precision": "float64"}
+    if integrator == "explicit_euler":
+        data["solver"]["dt"] = 4.5e-4
+    simulator = Simulator(Scene.model_validate(data), device=device)
+    x, v = simulator.positions, rng.normal(size=(125, 3))
+    x[:, 1], v[:, 1] = rng.uniform(0.001, 0.2, 125), rng.uniform(-3.0, -1.0, 125)
+    set_state(simulator, x=x, v=v)
+    # At least 1 m/s for 0.2 m, and half a period in contact: pi sqrt(m/k) = 0.07 s for 1 kg.
+    simulator.step(1000)
+    after = simulator.velocities
+    assert (after[:, 1] > 0).all()
+    assert (np.linalg.norm(after, axis=1) <= np.linalg.norm(v, axis=1)).all()

@@ -9,7 +9,7 @@ import pytest
 import reference
 import warp as wp
 from reference import EPSILON, ROUND_OFF, World
-from worlds import make_scene, set_state
+from worlds import make_scene, set_state, step_of, substeps_of
 
 from warpjelly.errors import InputError
 from warpjelly.kernels import fields
@@ -45,7 +45,7 @@ def field_forces(
     wp.launch(
         fields.add_field_forces,
         dim=len(points),
-        inputs=[charge, model.fields, step, x, v, wp.float64(scene.dt), wp.float64(options["time"])],
+        inputs=[charge, model.fields, step, x, v, wp.float64(step_of(scene)), wp.float64(options["time"])],
         outputs=[f],
         device=device,
     )
@@ -60,8 +60,10 @@ def test_a_constant_force_accelerates_by_the_sum_of_the_scheme(precision: str, d
     x0 = sim.positions.astype(float)
     sim.step(n)
     # Particles have 0.01 kg. As in free fall: half an epsilon of up to 1 m, and of up to 2.5 m/s for n dt, per step.
-    expected = x0 + force / 0.01 * scene.dt**2 * n * (n + 1) / 2
-    np.testing.assert_allclose(sim.positions, expected, rtol=0, atol=EPSILON[precision] * n * (1 + 2.5 * n * scene.dt))
+    expected = x0 + force / 0.01 * step_of(scene) ** 2 * n * (n + 1) / 2
+    np.testing.assert_allclose(
+        sim.positions, expected, rtol=0, atol=EPSILON[precision] * n * (1 + 2.5 * n * step_of(scene))
+    )
 
 
 def test_a_grid_reproduces_trilinear_functions(precision: str, device: str) -> None:
@@ -163,13 +165,13 @@ def test_a_charge_circles_in_a_magnetic_field(precision: str, device: str) -> No
     # All particles move alike, so springs stay at rest. With u = vx + i vy, q v x B makes u' = u (1 - i w dt).
     w, n = 0.02 * b[2] / 0.01, 400
     sim.step(n)
-    u = (1.0 + 0.5j) * (1 - 1j * w * scene.dt) ** n
+    u = (1.0 + 0.5j) * (1 - 1j * w * step_of(scene)) ** n
     # Each step rounds v by half an epsilon of up to 2 m/s, and the springs answer the rounding of x.
     bound = ROUND_OFF[precision] * n
     expected = np.tile([u.real, u.imag, 0.25], (8, 1))
     np.testing.assert_allclose(sim.velocities, expected, rtol=0, atol=bound)
     # It has turned far.
-    assert n * np.arctan(w * scene.dt) > 2.0
+    assert n * np.arctan(w * step_of(scene)) > 2.0
 
 
 def test_a_charge_falls_in_an_electric_field(precision: str, device: str) -> None:
@@ -178,7 +180,7 @@ def test_a_charge_falls_in_an_electric_field(precision: str, device: str) -> Non
     scene = make_charged(precision, [field])
     sim, n = Simulator(scene, device=device), 300
     sim.step(n)
-    expected = np.array([1.0, 0.5, 0.25]) + 0.02 / 0.01 * np.array(field["strength"]) * n * scene.dt
+    expected = np.array([1.0, 0.5, 0.25]) + 0.02 / 0.01 * np.array(field["strength"]) * n * step_of(scene)
     # Each step rounds v by half an epsilon of up to 4 m/s, and the springs answer the rounding of x.
     np.testing.assert_allclose(sim.velocities, np.tile(expected, (8, 1)), rtol=0, atol=ROUND_OFF[precision] * n)
     without = make_scene(solver={"precision": precision})
@@ -218,12 +220,12 @@ def test_the_clock_is_exact_after_many_steps(precision: str, device: str) -> Non
     set_state(sim, v=np.zeros((8, 3)))
     sim.step(100_000)
     assert sim.state.step.numpy().tolist() == [100_000] == [sim.substep_count]
-    assert sim.time == 100_000 * scene.dt
+    assert sim.time == 100_000 * step_of(scene)
     # A sum of float64 steps would be off by 1e-9 s, of float32 steps by more than 1 ms. The force of float32 is
     # rounded, which is also what the springs do about the shape: within 1e-4 of 100 N.
     sim._add_forces()
     mean = sim.forces.mean(axis=0)[0]
-    assert mean == pytest.approx(100_000 * scene.dt, rel={"float32": 1e-6, "float64": 1e-14}[precision])
+    assert mean == pytest.approx(100_000 * step_of(scene), rel={"float32": 1e-6, "float64": 1e-14}[precision])
 
 
 def test_fields_in_captured_frames_are_those_of_single_steps(device: str) -> None:
@@ -234,7 +236,7 @@ def test_fields_in_captured_frames_are_those_of_single_steps(device: str) -> Non
         fields=[{"type": "constant", "force": [0.1, -0.2, 0.3], "curve": curve}, make_grid([[0.1, 0.0, 0.2]] * 8)],
     )
     captured, single = Simulator(scene, device=device), Simulator(scene, device=device)
-    assert scene.substeps > MAX_CAPTURED_SUBSTEPS
+    assert substeps_of(scene) > MAX_CAPTURED_SUBSTEPS
     captured.advance_frame()
     single._capturable = False
     single.advance_frame()

@@ -131,7 +131,7 @@ def launch(
     precision: str,
     device: str,
 ) -> np.ndarray:
-    """Return f after a kernel has added the forces of the spans."""
+    """Return f after a kernel has added the forces of the spans, and check the power that it says is lost."""
     real = PRECISIONS[precision]
     rows = [wp.array(np.ascontiguousarray(a.T), dtype=real, device=device) for a in (x, v, f)]
     table = [
@@ -142,7 +142,20 @@ def launch(
         function, dim = springs.add_span_forces, len(spans)
     else:
         function, dim = springs.add_spring_forces, (len(spans), springs.MAX_SPAN)
-    wp.launch(function, dim=dim, inputs=[*table, *rows[:2]], outputs=[rows[2]], device=device)
+    # It adds to what was lost before.
+    losses = wp.array(np.full(len(spans), 3.0), dtype=wp.float64, device=device)
+    inputs = [*table, *rows[:2], real(0.25)]
+    wp.launch(function, dim=dim, inputs=inputs, outputs=[rows[2], losses], device=device)
+    for span, lost in zip(spans, losses.numpy(), strict=True):
+        i, j = (span[end] + np.arange(span[2]) for end in (0, 1))
+        offset, velocity = x[j] - x[i], v[j] - v[i]
+        length = np.linalg.norm(offset, axis=1)
+        approach = (velocity * offset).sum(axis=1) / np.where(length > 0, length, 1.0)
+        d = classes[span[3], 2]
+        # Each term is as exact as ROUND_OFF of d |v|^2; offsets lose digits like positions do.
+        bound = ROUND_OFF[precision] * d * ((velocity**2).sum(axis=1) * (1 + np.abs(x).max() / (length + 1e-9))).sum()
+        bound = min(bound, 1.0) + 3.0 * EPSILON["float64"] * (1 + span[2])
+        assert abs(lost - 3.0 - 0.25 * d * (approach**2).sum()) <= bound, kernel
     return rows[2].numpy().T.astype(float)
 
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from reference import ROUND_OFF, World
 from world_files import INDICES, WORLDS, WorldFile, sample_field
+from worlds import step_of, substeps_of
 
 from warpjelly.errors import InputError
 from warpjelly.scene import Scene
@@ -74,7 +75,7 @@ def test_a_world_is_read_as_the_format_says(tmp_path: Path, name: str) -> None:
     world = WORLDS[name]
     scene = load_scene(write(tmp_path / f"{name}.w", world))
     assert scene.solver.integrator == {"RK4": "rk4", "Euler": "explicit_euler"}[world.integrator]
-    assert (scene.dt, scene.substeps, scene.solver.precision) == (world.dt, world.n, "float64")
+    assert (step_of(scene), substeps_of(scene), scene.solver.precision) == (world.dt, world.n, "float64")
     assert scene.fps == 1 / (world.n * world.dt)
     assert (scene.name, scene.frame_count, scene.up_axis, scene.gravity) == (name, 300, "Z", (0.0, 0.0, 0.0))
     material = scene.materials["jelly"]
@@ -236,7 +237,7 @@ def test_samples_of_a_world_are_whole_steps(tmp_path: Path, caplog: pytest.LogCa
     with caplog.at_level(logging.WARNING, "warpjelly"):
         scene = load_scene(path, overrides={"fps": 60})
     # 1 / (60 * 0.0005) = 33.3
-    assert (scene.dt, scene.substeps, scene.frame_count) == (0.0005, 33, 300)
+    assert (step_of(scene), substeps_of(scene), scene.frame_count) == (0.0005, 33, 300)
     assert scene.fps == pytest.approx(60.606, rel=1e-4)
     assert "every 33 steps" in caplog.text
     assert load_scene(path, frames=7).frame_count == 7
@@ -257,7 +258,7 @@ def test_exact_steps_decide_fps(tmp_path: Path) -> None:
         '[[bodies]]\ntype = "cube"\nmaterial = "m"\nparticles_per_edge = 2\n'
     )
     scene = load_scene(path)
-    assert (scene.dt, scene.substeps, scene.fps) == (0.0007, 3, 1 / (3 * 0.0007))
+    assert (step_of(scene), substeps_of(scene), scene.fps) == (0.0007, 3, 1 / (3 * 0.0007))
     with pytest.raises(InputError, match=r"fps = 60\.0: leave it out"):
         load_scene(path, overrides={"fps": 60.0})
     sim = Simulator(scene, device="cpu")
@@ -317,7 +318,7 @@ def test_a_scene_that_fits_becomes_a_world(tmp_path: Path, device: str) -> None:
     scene = load_scene(path)
     write_world(scene, tmp_path / "a.w")
     world = load_scene(tmp_path / "a.w")
-    assert (world.dt, world.substeps, world.solver.integrator) == (scene.dt, scene.substeps, "rk4")
+    assert (step_of(world), substeps_of(world), world.solver.integrator) == (step_of(scene), substeps_of(scene), "rk4")
     sims = [
         Simulator(load_scene(p, overrides={**ANY_SCHEME, "solver.precision": "float64"}), device=device)
         for p in (path, tmp_path / "a.w")

@@ -24,6 +24,7 @@ def make_scene(*, solver: dict[str, Any] | None = None, **changes: Any) -> Scene
         "frames": 2,
         "gravity": [0.0, 0.0, 0.0],
         "materials": {"jelly": make_material()},
+        "contact": {"static_friction": 0.0, "dynamic_friction": 0.0},
         "bodies": [{"name": "cube", "type": "cube", "material": "jelly", "particles_per_edge": 2}],
     }
     return Scene.model_validate({**data, "solver": {"dt": 1e-3, "precision": "float64", **(solver or {})}, **changes})
@@ -36,7 +37,18 @@ def make_voxels(cells: np.ndarray, **changes: Any) -> dict[str, Any]:
 
 
 def set_state(simulator: Simulator, *, x: np.ndarray | None = None, v: np.ndarray | None = None) -> None:
-    """Put the particles elsewhere, [particle_count, 3] each."""
-    for rows, values in ((simulator.state.x, x), (simulator.state.v, v)):
+    """Put the particles elsewhere, as if they had always been there, [particle_count, 3] each."""
+    for rows, values in ((simulator.state.x, x), (simulator.state.x_start, x), (simulator.state.v, v)):
         if values is not None:
             rows.assign(np.ascontiguousarray(np.asarray(values).T))
+
+
+def substeps_of(scene: Scene) -> int:
+    """Return the substeps per frame of a scene whose step is a number."""
+    assert scene.solver.dt != "auto"
+    return scene.substeps_for(scene.solver.dt)
+
+
+def step_of(scene: Scene) -> float:
+    """Return the time step of a scene, s."""
+    return scene.dt_for(substeps_of(scene))
