@@ -110,7 +110,7 @@ def push_fully(
         dim=(count, lanes),
         inputs=[
             *(wp.full(len(x), mass, dtype=real, device=device), begin, body, model.colliders, lower, upper),
-            *(x_start, xs, vs, wp.full(1, step, dtype=wp.int32, device=device)),
+            *(x_start, xs, vs, wp.full(1, step, dtype=wp.int64, device=device)),
             *(real(simulator.dt), real(1.0), first, culling, lanes),
         ],
         outputs=[*memory, f, losses],

@@ -238,7 +238,13 @@ def contact_law(collider: Any, contact: Any) -> dict[str, Any]:
 
 
 def contact_forces(
-    law: dict[str, Any], touch: Touch, v: np.ndarray, applied: np.ndarray, m: np.ndarray, dt: float, given: np.ndarray
+    law: dict[str, Any],
+    touch: Touch,
+    v: np.ndarray,
+    applied: np.ndarray,
+    m: np.ndarray,
+    dt: float,
+    given: np.ndarray | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the normal reactions and the frictions on particles, [n, 3] each.
 
@@ -249,9 +255,10 @@ def contact_forces(
         applied: all forces but the reactions of colliders, [n, 3].
         m: masses, [n].
         dt: the step.
-        given: friction that other colliders gave already, [n, 3].
+        given: friction that other colliders gave already, [n, 3]; none unless given.
     """
     reactions, frictions = np.zeros_like(v), np.zeros_like(v)
+    given = np.zeros_like(v) if given is None else given
     for i in np.flatnonzero(touch.here):
         n = touch.normal[i]
         push = law["stiffness"] * touch.counted[i] - law["damping"] * (v[i] @ n)

@@ -34,7 +34,12 @@ def launch_everything() -> None:
     ]
     cube = {"type": "cube", "material": "jelly", "particles_per_edge": 2}
     bodies = [cube, {**cube, "position": [3.0, 0.0, 0.0]}]
-    parts = {"bodies": bodies, "colliders": colliders, "fields": [{"type": "constant", "force": [0.0, 0.0, 0.0]}]}
+    parts = {
+        "bodies": bodies,
+        "soft_contact": {},
+        "colliders": colliders,
+        "fields": [{"type": "constant", "force": [0.0, 0.0, 0.0]}],
+    }
     for precision, integrator in itertools.product(("float32", "float64"), ("rk4", "semi_implicit_euler")):
         solver = {"precision": precision, "integrator": integrator}
         simulator = Simulator(make_scene(**parts, solver=solver), device="cpu")

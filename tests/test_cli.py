@@ -376,7 +376,7 @@ def test_a_world_runs_and_comes_back(warpjelly, tmp_path):
     """Run a world, export it again, keep what is there unless forced, and refuse a bad one with its line."""
     world = tmp_path / "left.w"
     world.write_text(WORLDS["left"].text())
-    settings = ["--set", "solver.integrator=semi_implicit_euler", "--frames", 3, "--json"]
+    settings = ["--frames", 3, "--json"]
     code, out, err = warpjelly("run", world, *settings, "-o", tmp_path / "run")
     assert (code, err) == (0, "")
     record = json.loads(out)

@@ -25,6 +25,7 @@ def make_scene(*, solver: dict[str, Any] | None = None, **changes: Any) -> Scene
         "gravity": [0.0, 0.0, 0.0],
         "materials": {"jelly": make_material()},
         "contact": {"static_friction": 0.0, "dynamic_friction": 0.0},
+        "soft_contact": {"mode": "off"},
         "bodies": [{"name": "cube", "type": "cube", "material": "jelly", "particles_per_edge": 2}],
     }
     return Scene.model_validate({**data, "solver": {"dt": 1e-3, "precision": "float64", **(solver or {})}, **changes})
