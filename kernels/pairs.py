@@ -15,6 +15,8 @@ wp.set_module_options({"enable_backward": False})
 
 # The search radius is grown by this share, so that rounding in the grid never hides a pair.
 SEARCH_MARGIN = 1e-5
+# Nearer than the sum of radii at rest is nearer by more than this share, far above the rounding of places at rest.
+REST_MARGIN = 1e-3
 # Farther from the origin than this [m], no cell of the grid has a number.
 LOST = 1e7
 
@@ -96,7 +98,9 @@ def may_collide(
     if skin_body[a] == skin_body[b]:
         collide = with_itself
         if collide:
-            collide = wp.length(skin_rest[a] - skin_rest[b]) >= reach and not are_joined(
+            # Opposite walls of a gap of one cell are exactly that far apart at rest: rounding must not decide.
+            apart = reach * type(reach)(1.0 - REST_MARGIN)
+            collide = wp.length(skin_rest[a] - skin_rest[b]) >= apart and not are_joined(
                 neighbor_start, neighbors, a, b
             )
     return collide
