@@ -24,7 +24,7 @@ log = logging.getLogger("warpjelly")
 # A captured graph holds at most this many substeps; longer frames replay it. Capturing costs as much as ten replays.
 MAX_CAPTURED_SUBSTEPS = 64
 # Cells along each axis of the grid in which colliding particles are sorted; it repeats beyond.
-GRID_SIZE = 64
+GRID_SIZE = 32
 # Warp cannot capture in two threads at once.
 _capture_lock = threading.Lock()
 
@@ -360,7 +360,8 @@ class Simulator:
     def _build_grid(self, skin: Skin) -> None:
         """Sort the particles of the skin into the grid, at their current positions."""
         self._launch(pairs.gather_skin, len(skin.particles), [skin.particles, self.state.x], [self._skin_points])
-        self._grid.build(self._skin_points, 2.0 * skin.greatest_radius)
+        # Cells of two balls' width: fewer of them to search than of one, and hardly more balls.
+        self._grid.build(self._skin_points, 4.0 * skin.greatest_radius)
 
     def _add_pair_forces(self, skin: Skin, loss_weight: float) -> None:
         model, state, real = self.model, self.state, self.model.real
