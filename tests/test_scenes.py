@@ -22,6 +22,7 @@ SWITCHED_OFF = [
     ("tree_drop", {"colliders": []}, "rest_height"),
     ("tree_drop", {"colliders.floor.stiffness": 2000.0}, "penetration"),
     ("coupler_drop", {"colliders": [], "duration": 1.0}, "squash"),
+    ("two_cubes", {"soft_contact.mode": "off"}, "displacement"),
     ("u_on_sphere", {"colliders.ball.center": [100.0, 0.0, 0.0]}, "bounce"),
     ("u_on_sphere", {"colliders.room.center": [100.0, 0.0, 0.0]}, "rest_height"),
 ]
