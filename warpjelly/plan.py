@@ -150,10 +150,11 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
     )
     grid = voxelize(np.asarray(mesh.triangles) * body.scale, body.resolution)
     if grid.open_columns or not mesh.is_watertight:
-        log.warning(
-            "%s: the mesh is not watertight; %d of its %d columns of voxels run through a hole and may be wrong",
-            body.file, grid.open_columns, grid.cells.shape[1] * grid.cells.shape[2],
-        )  # fmt: skip
+        columns = grid.cells.shape[1] * grid.cells.shape[2]
+        harm = "no voxel is concerned"
+        if grid.open_columns:
+            harm = f"{grid.open_columns} of its {columns} columns of voxels run through a hole and may be wrong"
+        log.warning("%s: the mesh is not watertight; %s", body.file, harm)
     if not grid.cells.any():
         raise InputError(
             f"{body.file}: no cell of the grid has its centre inside the model at resolution {body.resolution}; "

@@ -16,6 +16,7 @@ from .colors import SRGB_TABLE, srgb_from_linear
 from .errors import EnvironmentFailedError, InputError
 from .files import whole_file
 from .usd import open_stage
+from .validate import stage_problems
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -59,6 +60,9 @@ def render_preview(
     if output.suffix.lower() != ".png":
         raise InputError(f"{output}: a preview is a PNG; choose a name that ends in .png")
     stage = open_stage(source)
+    # Damage that only shows when values are read would otherwise come as whatever trips over it.
+    if problems := stage_problems(source):
+        raise InputError(f"{source}: the stage is not sound, so it cannot be shown: {problems[0]}")
     shown = _chosen_frames(stage, source, frames)
     if not all(MIN_SIZE <= side <= MAX_SIZE for side in size):
         raise InputError(f"size {size[0]}x{size[1]}: each side must be {MIN_SIZE} to {MAX_SIZE} pixels")
@@ -325,8 +329,8 @@ def _laid_out(stage: Usd.Stage, frames: list[int], panels: list[np.ndarray]) -> 
     if legend and height >= 120:
         low, high = (f"{force:.2g}" for force in legend["range"])
         caption = f"{legend['quantity']}, {legend['unit']}"
-        # The bar is as wide as its captions need, a line's height between them.
-        needed = sum(font.getlength(label) for label in (low, caption, high)) + 2 * text
+        # The bar is as wide as its captions need, a line's height between them; the middle one is centred.
+        needed = font.getlength(caption) + 2 * max(font.getlength(low), font.getlength(high)) + 2 * text
         bar = Image.fromarray(np.rint(SRGB_TABLE[None] * 255).astype(np.uint8))
         bar = bar.resize((max(width // 5, round(needed)), max(text // 2, 4)))
         left, top = picture.width - bar.width - text, height - 2 * text - bar.height - 2

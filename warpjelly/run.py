@@ -80,6 +80,8 @@ def simulate(
         EnvironmentFailedError: the run directory cannot be written.
     """
     folder = Path(output) if output is not None else Path("outputs") / scene.name
+    if folder.exists() and not folder.is_dir():
+        raise EnvironmentFailedError(f"{folder}: cannot write the run: it is a file; choose a folder with -o")
     if not force:
         _refuse_to_replace(folder)
     plan = plan_scene(scene)
@@ -223,7 +225,7 @@ def provenance(scene: Scene, sim: Simulator) -> dict[str, Any]:
     """Return what is needed to repeat a run."""
     packages = ("warpjelly", "warp-lang", "numpy", "usd-core", "trimesh")
     return {
-        "resolved_scene": scene.model_dump(mode="json", exclude_none=True),
+        "resolved_scene": scene.model_dump(mode="json", exclude_none=True) | {"gravity": scene.gravity_vector.tolist()},
         "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in packages},
         "machine": platform.machine(),
         "device": sim.device,

@@ -601,6 +601,8 @@ class Expectation(Table):
     def _something_is_bounded(self) -> Self:
         if self.min is None and self.max is None:
             raise PydanticCustomError("expectation", "give min, max or both")
+        if self.min is not None and self.max is not None and self.min > self.max:
+            raise PydanticCustomError("expectation", "min must not be above max")
         return self
 
 
@@ -635,7 +637,7 @@ AnyField = Annotated[ConstantField | GridField | ElectricField | MagneticField, 
 class Scene(Table):
     """A whole scene."""
 
-    name: Name = Field(description="names the run directory; the file's name unless given")
+    name: Name = Field("scene", description="names the run directory; the file's name unless given")
     duration: Positive | None = Field(None, description="s; 2 unless frames is given")
     frames: int | None = Field(
         None, strict=True, ge=1, le=MAX_FRAMES, description="number of samples, instead of duration"

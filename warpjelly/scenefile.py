@@ -50,7 +50,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
     # TOML's own errors are among these, and numbers of thousands of digits.
@@ -80,8 +80,11 @@ def _override(data: dict[str, Any], key: str, value: Any) -> None:
 
 
 def _entry(entries: list[Any], part: str, key: str) -> int:
-    """Return the position of a list entry given by its number or its name."""
-    names = [entry.get("name") if isinstance(entry, dict) else None for entry in entries]
+    """Return the position of a list entry given by its number or its name, also one that it gets for having none."""
+    names = [
+        entry.get("name", f"{entry.get('type')}_{i}") if isinstance(entry, dict) else None
+        for i, entry in enumerate(entries)
+    ]
     if part in names:
         return names.index(part)
     if part.isdigit() and int(part) < len(entries):
@@ -96,6 +99,18 @@ def _identifier(text: str) -> str:
     return name if name and not name[0].isdigit() else f"_{name}"
 
 
+# What pydantic says in terms of Python, in terms of a scene.
+_WORDS = {
+    "tuple_type": "must be a list of numbers",
+    "list_type": "must be a list; tables of a list are headed [[bodies]], with two brackets",
+    "dict_type": "must be a table",
+    "model_type": "must be a table",
+    "model_attributes_type": "must be a table",
+    "string_pattern_mismatch": "must be letters, digits and _, and not start with a digit",
+    "too_short": "must not be empty",
+}
+
+
 def _explain(error: ValidationError) -> str:
     """Say in one line what is wrong with the scene first: key, value, what is allowed."""
     problems = error.errors(include_url=False)
@@ -103,7 +118,7 @@ def _explain(error: ValidationError) -> str:
     context = first.get("ctx", {})
     value = first["input"]
     key = _key(first["loc"])
-    what = first["msg"].replace("Input should", "must").replace("Value should", "must")
+    what = _WORDS.get(first["type"], first["msg"]).replace("Input should", "must").replace("Value should", "must")
     if first["type"] in ("unknown_key", "scene"):
         key = ".".join(filter(None, [key, context["key"]]))
     if first["type"] == "unknown_key":

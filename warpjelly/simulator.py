@@ -121,7 +121,13 @@ class Simulator:
             self._graph(substeps)
 
     def step(self, count: int = 1) -> None:
-        """Advance by a number of substeps."""
+        """Advance by a number of substeps.
+
+        Raises:
+            ValueError: the number is negative.
+        """
+        if count < 0:
+            raise ValueError(f"cannot step back by {-count} substeps")
         frames, rest = divmod(count, self.substeps)
         for substeps in self._frame_blocks() * frames + [1] * rest:
             if (graph := self._graph(substeps)) is not None:

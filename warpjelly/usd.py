@@ -156,7 +156,7 @@ def open_stage(source: Path) -> Usd.Stage:
     try:
         return Usd.Stage.Open(str(path))
     except Tf.ErrorException as error:
-        raise InputError(f"{path}: not a readable USD file: {_reason(error)}") from error
+        raise InputError(f"{path}: not a readable USD file: {reason(error)}") from error
 
 
 def _vectors(array: np.ndarray) -> Vt.Vec3fArray:
@@ -443,12 +443,12 @@ def _export(layer: Sdf.Layer, path: Path) -> None:
             if not layer.Export(str(unfinished)):
                 raise EnvironmentFailedError(f"{path}: cannot write the stage")
     except Tf.ErrorException as error:
-        raise EnvironmentFailedError(f"{path}: cannot write the stage: {_reason(error)}") from error
+        raise EnvironmentFailedError(f"{path}: cannot write the stage: {reason(error)}") from error
     except OSError as error:
         raise EnvironmentFailedError(f"{path}: cannot write the stage: {error.strerror}") from error
 
 
-def _reason(error: Tf.ErrorException) -> str:
+def reason(error: Tf.ErrorException) -> str:
     """Return what an error of USD says first, without the place in USD's source that reports it."""
     said = re.search(r" : '(.*?)'\s*$", str(error), re.MULTILINE)
     return said[1] if said else " ".join(str(error).split())

@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
 
-from .usd import open_stage
+from .usd import open_stage, reason
 
 # The newest crate version that common viewers open.
 MAX_CRATE_VERSION = (0, 8, 0)
@@ -26,15 +26,23 @@ def stage_problems(path: Path) -> list[str]:
         InputError: there is no such file, or it is not a USD file.
     """
     stage = open_stage(path)
-    found = [*_files(stage), *_usd_validators(stage), *_metadata(stage), *_structure(stage)]
+    found: list[str] = []
+    try:
+        for check in (_files, _usd_validators, _metadata, _structure, _shapes):
+            found += check(stage)
+    except Tf.ErrorException as error:
+        found.append(f"the file is damaged: {reason(error)}")
+    return found
+
+
+def _shapes(stage: Usd.Stage) -> Iterator[str]:
     for prim in stage.Traverse():
         if prim.IsA(UsdGeom.Gprim):
             samples_with: dict[str, list[float | None]] = {}
             for time, problem in _shape(stage, prim):
                 samples_with.setdefault(problem, []).append(time)
             for problem, times in samples_with.items():
-                found.append(f"{prim.GetPath()}: {problem}{_located(times)}")
-    return found
+                yield f"{prim.GetPath()}: {problem}{_located(times)}"
 
 
 def _located(times: list[float | None]) -> str:
