@@ -46,6 +46,8 @@ class Observer:
         self._centers: list[np.ndarray] = []
         self._heights: list[np.ndarray] = []
         self._depths: list[np.ndarray] = []
+        self.diverged = False
+        """Whether the run diverged after the last frame that was observed; for whoever runs it to set."""
 
     def observe(self, penetrations: np.ndarray) -> None:
         """Take in the current frame; penetrations are those of ``Simulator.diagnostics``."""
@@ -62,7 +64,7 @@ class Observer:
     def outcomes(self) -> list[Outcome]:
         """Return the quantities that the scene bounds, at the last frame that was observed."""
         found = []
-        for quantity, expectation in self._expectations:
+        for _, quantity, expectation in self._expectations:
             bodies = self._sim.model.bodies
             number = next((i for i, body in enumerate(bodies) if body.name == expectation.body), 0)
             value = float(getattr(self, f"_{quantity}")(number))
@@ -74,6 +76,15 @@ class Observer:
 
     def _displacement(self, body: int) -> float:
         return float(np.linalg.norm(self._centers[-1][body] - self._centers[0][body]))
+
+    def _reach(self, body: int) -> float:
+        centers = np.array(self._centers)[:, body]
+        return float(np.linalg.norm(centers - centers[0], axis=1).max())
+
+    def _rotation(self, body: int) -> float:
+        part = self._sim.model.bodies[body].particles
+        rotation = rigid_fit(self._rest[part], self._positions[part])
+        return float(np.degrees(np.arccos(np.clip((np.trace(rotation) - 1.0) / 2.0, -1.0, 1.0))))
 
     def _speed(self, body: int) -> float:
         return np.linalg.norm(self._velocities[self._sim.model.bodies[body].particles], axis=1).max()
@@ -94,11 +105,15 @@ class Observer:
     def _penetration(self, body: int) -> float:
         return np.array(self._depths)[:, body].max() / self._sim.model.bodies[body].unit
 
+    def _diverges(self, body: int) -> float:
+        return float(self.diverged)
 
-def rigid_fit_error(rest: np.ndarray, now: np.ndarray) -> float:
-    """Return the rms distance of points from the best rigid fit of their rest shape, as a share of its diagonal.
 
-    The best rotation follows from a singular value decomposition (Kabsch 1976, doi:10.1107/S0567739476001873).
+def rigid_fit(rest: np.ndarray, now: np.ndarray) -> np.ndarray:
+    """Return the rotation that best takes points to where they are now, up to a shift, [3, 3]; NaN if they are lost.
+
+    It follows from a singular value decomposition (Kabsch 1976, doi:10.1107/S0567739476001873). A row vector x goes
+    to x times the rotation.
 
     Args:
         rest: [count, 3].
@@ -106,9 +121,20 @@ def rigid_fit_error(rest: np.ndarray, now: np.ndarray) -> float:
     """
     a, b = rest - rest.mean(axis=0), now - now.mean(axis=0)
     if not np.isfinite(b).all():
-        return float("nan")
+        return np.full((3, 3), np.nan)
     u, _, vt = np.linalg.svd(a.T @ b)
     # A reflection would fit better than any rotation when the determinant is negative; it is not a motion.
     u[:, -1] *= np.sign(np.linalg.det(u @ vt))
-    rms = np.sqrt(((a @ u @ vt - b) ** 2).sum(axis=1).mean())
+    return np.asarray(u @ vt)
+
+
+def rigid_fit_error(rest: np.ndarray, now: np.ndarray) -> float:
+    """Return the rms distance of points from the best rigid fit of their rest shape, as a share of its diagonal.
+
+    Args:
+        rest: [count, 3].
+        now: the same points, [count, 3].
+    """
+    a, b = rest - rest.mean(axis=0), now - now.mean(axis=0)
+    rms = np.sqrt(((a @ rigid_fit(rest, now) - b) ** 2).sum(axis=1).mean())
     return float(rms / np.linalg.norm(np.ptp(rest, axis=0)))

@@ -143,6 +143,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         writer.close()
     stages = len(STAGES.get(scene.solver.integrator, [None]))
     forces = max(frames - 1, 0) * sim.substeps * stages
+    observer.diverged = isinstance(ended, DivergedError)
     outcomes = observer.outcomes()
     record = {
         "scene": scene.name,

@@ -19,9 +19,11 @@ import numpy as np
 from pydantic import (
     BaseModel,
     ConfigDict,
+    Discriminator,
     Field,
     SerializerFunctionWrapHandler,
     StringConstraints,
+    Tag,
     ValidationInfo,
     WithJsonSchema,
     field_validator,
@@ -606,27 +608,48 @@ class Expectation(Table):
         return self
 
 
-class Expect(Table):
-    """What the scene is for, as numbers; ``warpjelly run`` measures and reports them."""
+# Bounds on one body, or a list of bounds on several. The tags are in brackets so that errors do not name them.
+Expectations = Annotated[
+    Annotated[Expectation, Tag("[one]")] | Annotated[list[Expectation], Field(min_length=1), Tag("[several]")],
+    Discriminator(lambda given: "[several]" if isinstance(given, list) else "[one]"),
+]
 
-    rest_height: Expectation | None = Field(None, description="height of the centre of mass at the end, m")
-    displacement: Expectation | None = Field(None, description="distance of the centre of mass from its start, m")
-    speed: Expectation | None = Field(None, description="greatest particle speed at the end, m/s")
-    shape_error: Expectation | None = Field(
-        None,
-        description="rms distance from the best rigid fit of the rest shape at the end, share of the body's diagonal",
+
+class Expect(Table):
+    """What the scene is for, as numbers; ``warpjelly run`` measures and reports them. A list bounds several bodies."""
+
+    rest_height: Expectations | None = Field(None, description="height of the centre of mass at the end, m")
+    displacement: Expectations | None = Field(
+        None, description="distance of the centre of mass from its start at the end, m"
     )
-    squash: Expectation | None = Field(None, description="least height of the body over the run, share of its first")
-    bounce: Expectation | None = Field(None, description="greatest rise of the centre of mass after its first low, m")
-    penetration: Expectation | None = Field(
+    reach: Expectations | None = Field(
+        None, description="greatest distance of the centre of mass from its start over the run, m"
+    )
+    rotation: Expectations | None = Field(
+        None, description="angle of the best rigid fit of the first shape at the end, degrees, at most 180"
+    )
+    speed: Expectations | None = Field(None, description="greatest particle speed at the end, m/s")
+    shape_error: Expectations | None = Field(
+        None,
+        description="rms distance from the best rigid fit of the first shape at the end, share of the body's diagonal",
+    )
+    squash: Expectations | None = Field(None, description="least height of the body over the run, share of its first")
+    bounce: Expectations | None = Field(None, description="greatest rise of the centre of mass after its first low, m")
+    penetration: Expectations | None = Field(
         None, description="greatest depth of a particle in a collider over the run, in unit cells"
     )
+    diverges: Expectations | None = Field(
+        None, description="1 if the run diverged, otherwise 0; a scene that is to diverge says { min = 1.0 }"
+    )
 
-    def items(self) -> Iterator[tuple[str, Expectation]]:
-        """Yield the quantities that are bounded, by name."""
+    def items(self) -> Iterator[tuple[str, str, Expectation]]:
+        """Yield what is bounded: its dotted key in this table, the quantity, the bounds."""
         for name in type(self).model_fields:
-            if (expectation := getattr(self, name)) is not None:
-                yield name, expectation
+            given = getattr(self, name)
+            if isinstance(given, list):
+                yield from ((f"{name}.{i}", name, expectation) for i, expectation in enumerate(given))
+            elif given is not None:
+                yield name, name, given
 
 
 AnyBody = Annotated[CubeBody | VoxelsBody | ModelBody | NetworkBody | ClothBody, Field(discriminator="type")]
@@ -693,12 +716,12 @@ class Scene(Table):
             if not body.has_volume and material.density is not None:
                 why = f"it has a density, but a {body.type} has no volume: use particle_mass, and law strain or hooke"
                 refuse(f"bodies.{i}.material", body.material, why)
-        for quantity, expectation in self.expect.items():
+        for key, _, expectation in self.expect.items():
             bodies = ", ".join(str(body.name) for body in self.bodies)
             if expectation.body is None and len(self.bodies) > 1:
-                refuse(f"expect.{quantity}.body", None, f"name one of the bodies: {bodies}")
+                refuse(f"expect.{key}.body", None, f"name one of the bodies: {bodies}")
             if expectation.body is not None and expectation.body not in bodies.split(", "):
-                refuse(f"expect.{quantity}.body", expectation.body, f"no such body; bodies: {bodies}")
+                refuse(f"expect.{key}.body", expectation.body, f"no such body; bodies: {bodies}")
         if self.duration is not None and self.frames is not None:
             refuse("duration", self.duration, "give duration or frames, not both")
         if self.duration is not None and not 1 <= round(self.duration * self.fps) <= MAX_FRAMES:
