@@ -138,7 +138,7 @@ def test_a_grid_is_read_from_numpy_files(tmp_path, device: str) -> None:
         ({"fields.0.file": "none.npy"}, "no such file"),
         ({"fields.0.lower": [1.0, -1.0, -1.0]}, "lower must be below upper"),
         ({"fields.0.curve": [[0.0, 1.0], [0.0, 2.0]]}, "times must ascend"),
-        ({"fields.0.curve": []}, "at least 1"),
+        ({"fields.0.curve": []}, "must not be empty"),
         ({"fields.0.type": "wind"}, "'constant'"),
         ({"fields.0.outsid": "zero"}, "did you mean 'outside'"),
         ({"fields.0.file": "scene.toml", "fields.0.forces": None}, "not a NumPy file"),
