@@ -18,6 +18,7 @@ import numpy as np
 
 from .errors import InputError
 from .scene import (
+    DEFAULT_PARTICLE_MASS,
     MAX_LENGTH,
     MAX_MAGNITUDE,
     MAX_SUBSTEPS,
@@ -286,7 +287,7 @@ def _one_kind(material: Material, key: str) -> tuple[tuple[float, float], float]
     for kind in ("shear", "bend"):
         same = getattr(material, kind) == material.structural
         _require(same, f"{key}.{kind}", "differs from structural; a world has one kind of spring")
-    mass = 0.01 if material.particle_mass is None else material.particle_mass
+    mass = DEFAULT_PARTICLE_MASS if material.particle_mass is None else material.particle_mass
     return (material.structural.stiffness, material.structural.damping), mass
 
 
