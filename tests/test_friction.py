@@ -49,9 +49,11 @@ def put_on_incline(
 @pytest.mark.parametrize("per_edge", [2, 4])
 def test_incline_below_the_friction_angle_holds(kind: str, per_edge: int) -> None:
     """Lie still for 10 s at one degree below arctan mu_s, from rest."""
-    # At rest means in balance: a cube put there unstrained first shakes, and the uphill feet, which a slope of 25
-    # degrees leaves half of their load, slip; with mu_d < tan t it then goes on sliding, as it should. So it comes to
-    # rest with both coefficients between tan t = 0.478 and mu_s.
+    # At rest means in balance, foot by foot. A cube put there unstrained strains all feet alike, but does not load
+    # them alike: with T = tan t = 0.478, balance about the centre gives the two rows of 2^3 particles (1 -+ T)/2 of the
+    # load. The uphill row has to hold T/2 > mu_s (1 - T)/2 and slips; while it does, both can hold no more than
+    # mu_d (1 - T)/2 + mu_s (1 + T)/2 = 0.474 < T, and with mu_d < T what slides goes on. So the cube comes to rest with
+    # both coefficients between T and mu_s.
     settling, _ = put_on_incline(REST_ANGLE - 1, kind, per_edge, friction=0.49)
     settling.step(8000)
     simulator, down = put_on_incline(REST_ANGLE - 1, kind, per_edge)
@@ -63,6 +65,25 @@ def test_incline_below_the_friction_angle_holds(kind: str, per_edge: int) -> Non
         assert np.abs((simulator.positions - start) @ down).max() <= 0.01 * cell
     assert simulator.time == pytest.approx(10.0)
     assert simulator.diagnostics()["contacts"] == per_edge**2
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_single_particles_on_an_incline(integrator: str, device: str) -> None:
+    """Lie still for 10 s one degree below arctan mu_s, and slide with g (sin t - mu_d cos t) three degrees above."""
+    t = math.radians(REST_ANGLE - 1)
+    gravity = [G * math.sin(t), -G * math.cos(t), 0.0]
+    simulator = make_loose_particles(FLOOR, [0.0, 0.0, 0.0], gravity, device, integrator=integrator)
+    start = simulator.positions
+    simulator.step(10000)
+    # Each step brings the particle to rest, to the rounding of g dt; 1e4 of these after 1e4 steps of 1e-3 s.
+    assert np.abs(simulator.positions - start).max() <= 1e4 * 10 * EPSILON["float64"]
+    t = math.radians(REST_ANGLE + 3)
+    gravity = [G * math.sin(t), -G * math.cos(t), 0.0]
+    simulator = make_loose_particles(FLOOR, [0.0, 0.0, 0.0], gravity, device, integrator=integrator)
+    simulator.step(1000)
+    expected = G * (math.sin(t) - DYNAMIC * math.cos(t))
+    # From the first step on all forces are constant, so every scheme is exact.
+    np.testing.assert_allclose(simulator.velocities[:, 0], expected, rtol=1e-10)
 
 
 @pytest.mark.parametrize("integrator", INTEGRATORS)

@@ -21,11 +21,7 @@ SWITCHED_OFF = [
     ("falling_cloth", {"colliders.ball.center": [100.0, 0.0, 0.0]}, "rest_height"),
     ("force_grid", {"fields": []}, "reach"),
     ("hanging_cloth", {"bodies.cloth.pinned": []}, "rest_height"),
-    (
-        "incline_holds",
-        {"colliders.slope.static_friction": 0.2, "colliders.slope.dynamic_friction": 0.2},
-        "displacement",
-    ),
+    ("incline_holds", {"colliders.slope.static_friction": 0.4}, "displacement"),
     (
         "incline_slides",
         {"colliders.slope.dynamic_friction": 0.0, "colliders.slope.static_friction": 0.0},
