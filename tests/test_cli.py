@@ -358,6 +358,21 @@ def test_a_body_that_starts_in_a_collider_is_warned_of(warpjelly, tmp_path):
     assert "warning: body 'cube' starts 0.2 m deep in a collider" in err
 
 
+def test_a_plane_through_a_body_is_warned_of(warpjelly, tmp_path):
+    """Warn of a plane that cuts a body, with the depth, unless the body is beside, in front or wholly behind."""
+    lines = ["[materials.jelly]", "[[bodies]]", 'type = "cube"', 'material = "jelly"', "particles_per_edge = 3"]
+    lines += ["position = [HERE, 0.0]", "[[colliders]]", 'type = "plane"', 'name = "table"', "normal = [0.0, 2.0, 0.0]"]
+    lines += ["tangent = [1.0, 0.0, 0.0]", "size = [2.0, 2.0]", "threshold = 0.1"]
+    scene = tmp_path / "scene.toml"
+    found = {}
+    for here in ("0.0, 0.2", "0.0, 0.6", "0.0, -0.6", "2.0, 0.2"):
+        scene.write_text("\n".join(lines).replace("HERE", here))
+        code, _, err = warpjelly("check", scene)
+        assert code == 0
+        found[here] = "body 'cube_0' starts across plane 'table', 0.3 m deep: what is deeper than its threshold" in err
+    assert found == {"0.0, 0.2": True, "0.0, 0.6": False, "0.0, -0.6": False, "2.0, 0.2": False}
+
+
 def test_paths_with_spaces_and_other_letters_work(warpjelly, tmp_path):
     """Write to and read from a folder with spaces and non-ASCII letters."""
     folder = tmp_path / "süße Würfel 方"

@@ -22,14 +22,13 @@ from .plan import plan_scene
 from .scene import Scene
 from .simulator import Simulator
 from .stability import evaluations
+from .starts import warn_of_deep_starts
 from .surface import SurfaceMesh
 from .usd import STAGE_NAME, StageWriter
 
 log = logging.getLogger("warpjelly")
 
 RECORD_NAME, METRICS_NAME = "run.json", "metrics.csv"
-# A body that starts deeper than this in a collider, in unit cells, is thrown out of it, which is seldom meant.
-DEEP_START = 0.05
 # A run warns of a step above the limit where finding the limit takes at most this share of it, or at most as long as
 # evaluating the forces of so many springs once each, a second or less.
 LIMIT_SHARE = 0.02
@@ -86,7 +85,7 @@ def simulate(
         _refuse_to_replace(folder)
     plan = plan_scene(scene)
     sim = Simulator(plan, device=device)
-    _warn_of_deep_starts(sim)
+    warn_of_deep_starts(sim)
     _warn_of_long_steps(sim)
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -187,7 +186,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     """
     plan = plan_scene(scene)
     sim = Simulator(plan, device=device)
-    _warn_of_deep_starts(sim)
+    warn_of_deep_starts(sim)
     if broken := sim.broken_limit():
         log.warning("%s", broken)
     sim.step()
@@ -252,9 +251,3 @@ def _warn_of_long_steps(sim: Simulator) -> None:
         return
     if broken := sim.broken_limit():
         log.warning("%s", broken)
-
-
-def _warn_of_deep_starts(sim: Simulator) -> None:
-    for body, depth in zip(sim.model.bodies, sim.diagnostics()["penetrations"], strict=True):
-        if depth > DEEP_START * body.unit:
-            log.warning("body '%s' starts %.3g m deep in a collider and will be thrown out of it", body.name, depth)

@@ -1,0 +1,41 @@
+"""What is seldom meant of how a scene starts: bodies in colliders, and planes through bodies."""
+
+from __future__ import annotations
+
+import logging
+
+import numpy as np
+
+from .scene import PlaneCollider
+from .simulator import Simulator
+
+log = logging.getLogger("warpjelly")
+
+# A body that starts deeper than this in a collider, in unit cells, is thrown out of it.
+DEEP_START = 0.05
+
+
+def warn_of_deep_starts(sim: Simulator) -> None:
+    """Warn of each body that starts deep in a collider, before the first step."""
+    positions = sim.positions
+    planes = [collider for collider in sim.scene.colliders if isinstance(collider, PlaneCollider)]
+    for body, depth in zip(sim.model.bodies, sim.diagnostics()["penetrations"], strict=True):
+        cuts = [(_cut_depth(plane, positions[body.particles]), plane) for plane in planes]
+        deepest, plane = max(cuts, key=lambda cut: cut[0], default=(0.0, None))
+        if plane is not None and deepest > plane.threshold:
+            log.warning(
+                "body '%s' starts across plane '%s', %.3g m deep: what is deeper than its threshold of %.3g m stays "
+                "behind it",
+                *(body.name, plane.name, deepest, plane.threshold),
+            )
+        elif depth > DEEP_START * body.unit:
+            log.warning("body '%s' starts %.3g m deep in a collider and will be thrown out of it", body.name, depth)
+
+
+def _cut_depth(plane: PlaneCollider, points: np.ndarray) -> float:
+    """Return how far points [count, 3] reach behind the rectangle of a plane [m]; 0 if none is in front of it too."""
+    tangent, bitangent, normal = plane.frame()
+    local = points - np.array(plane.center)
+    a, b = plane.size
+    height = local[(np.abs(local @ tangent) <= a / 2) & (np.abs(local @ bitangent) <= b / 2)] @ normal
+    return float(-height.min()) if len(height) and height.min() < 0.0 < height.max() else 0.0
