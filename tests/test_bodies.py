@@ -132,16 +132,16 @@ def test_cloth_has_springs_in_two_dimensions(n: int, m: int) -> None:
             apart = sorted((abs(at[0] - to[0]), abs(at[1] - to[1])))
             if apart in ([0, 1], [1, 1], [0, 2]):
                 expected[a, b] = {1: 0, 2: 3}[apart[1]] if apart[0] == 0 else 1
-    assert len(cloth.springs) == len(expected)
-    assert {
-        (min(s), max(s)): kind for s, kind in zip(cloth.springs.tolist(), cloth.spring_kinds.tolist(), strict=True)
-    } == expected
+    ends, rows = cloth.springs()
+    assert len(ends) == len(expected)
+    kinds = cloth.classes.kinds[rows]
+    assert {(min(s), max(s)): kind for s, kind in zip(ends.tolist(), kinds.tolist(), strict=True)} == expected
     np.testing.assert_allclose(
         cloth.particles[:, [0, 2]], (np.array(places) - [(n - 1) / 2, (m - 1) / 2]) * step, atol=1e-15
     )
     assert not cloth.particles[:, 1].any()
-    offset = cloth.particles[cloth.springs[:, 1]] - cloth.particles[cloth.springs[:, 0]]
-    rest = cloth.classes.rest_lengths[cloth.spring_classes]
+    offset = cloth.particles[ends[:, 1]] - cloth.particles[ends[:, 0]]
+    rest = cloth.classes.rest_lengths[rows]
     # A difference of two rounded coordinates below 1.
     np.testing.assert_allclose(rest, np.linalg.norm(offset, axis=1), rtol=1e-14)
 
@@ -162,17 +162,22 @@ def test_springs_know_how_many_cells_contain_them(seed: int, weighted: bool) -> 
     cells = np.random.default_rng(seed).random((3, 4, 3)) < 0.5
     plain = build_lattice(cells, origin=np.zeros(3), cell_size=1.0)
     lattice = build_lattice(cells, origin=np.zeros(3), cell_size=1.0, weighted=weighted)
-    for field in ("particles", "springs", "spring_kinds", "cell_counts", "surface_quads"):
+    for field in ("particles", "cell_counts", "surface_quads"):
         np.testing.assert_array_equal(getattr(lattice, field), getattr(plain, field))
-    classes, rows = lattice.classes, lattice.spring_classes
+    classes = lattice.classes
+    ends, rows = lattice.springs()
+    plain_ends, plain_kinds = plain.springs()
+    assert Counter(zip(*ends.T.tolist(), classes.kinds[rows].tolist(), strict=True)) == Counter(
+        zip(*plain_ends.T.tolist(), plain_kinds.tolist(), strict=True)
+    )
     if not weighted:
         assert classes.cells is None
         return
-    found = {kind: int(classes.cells[rows[lattice.spring_kinds == kind]].sum()) for kind in range(3)}
+    found = {kind: int(classes.cells[rows[classes.kinds[rows] == kind]].sum()) for kind in range(3)}
     # Every cell has 12 edges, 12 face diagonals and 4 body diagonals.
     assert found == {kind: count * np.count_nonzero(cells) for kind, count in enumerate((12, 12, 4))}
     # Which spring got which share shows in the forces in test_young.py. Bend springs count at both springs under them.
-    bend = lattice.spring_kinds == 3
+    bend = classes.kinds[rows] == 3
     assert classes.bends[rows].sum() == 2 * classes.cells[rows[bend]].sum()
 
 
@@ -276,8 +281,10 @@ def test_plans_count_what_is_built(name: str) -> None:
 def test_material_tells_networks_kinds_apart() -> None:
     """Read back kinds and rest lengths of a network: structural, shear and bend rows, in the order of the scene."""
     network = build_network(BODIES["network"]["points"], [[(0, 1)], [(1, 2)], [(3, 0)]], [0.5, 0.25, 0.125])
-    assert network.spring_kinds.tolist() == [0, 1, 3]
-    assert network.classes.rest_lengths[network.spring_classes].tolist() == [0.5, 0.25, 0.125]
+    ends, rows = network.springs()
+    assert ends.tolist() == [[0, 1], [1, 2], [3, 0]]
+    assert network.classes.kinds[rows].tolist() == [0, 1, 3]
+    assert network.classes.rest_lengths[rows].tolist() == [0.5, 0.25, 0.125]
     assert network.unit == 0.125
 
 

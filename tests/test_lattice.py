@@ -15,7 +15,6 @@ from worlds import make_scene, make_voxels
 
 from warpjelly.kernels.springs import MAX_SPAN
 from warpjelly.lattice import Lattice, build_lattice, corner_labels, count_lattice
-from warpjelly.model import springs_to_spans
 from warpjelly.simulator import Simulator
 
 # Powers of two for edges and origin: positions in the grid come back exactly.
@@ -38,7 +37,8 @@ def name_particles(lattice: Lattice, vertices: np.ndarray) -> list[Key]:
     Each body diagonal lies in one unit cell, and a cell's four of them end in its eight corners.
     """
     owners: list[set[tuple[int, int, int]]] = [set() for _ in vertices]
-    for i, j in lattice.springs[lattice.spring_kinds == 2]:
+    ends, kinds = lattice.springs()
+    for i, j in ends[kinds == 2]:
         x, y, z = np.minimum(vertices[i], vertices[j])
         owners[i].add((int(x), int(y), int(z)))
         owners[j].add((int(x), int(y), int(z)))
@@ -58,13 +58,14 @@ def check(cells: np.ndarray, particles_per_edge: int) -> None:
     assert lattice.cell_counts.sum() == 8 * len(units)
 
     # The same springs, none twice in either direction.
-    ends = [frozenset((keys[i], keys[j])) for i, j in lattice.springs]
-    assert Counter(zip(ends, lattice.spring_kinds.tolist(), strict=True)) == Counter(expected.springs.items())
+    springs, kinds = lattice.springs()
+    ends = [frozenset((keys[i], keys[j])) for i, j in springs]
+    assert Counter(zip(ends, kinds.tolist(), strict=True)) == Counter(expected.springs.items())
 
     # Planned before built: particles exactly, springs never too few.
-    particles, springs, surface = count_lattice(cells, particles_per_edge=particles_per_edge)
+    particles, bound, _, surface = count_lattice(cells, particles_per_edge=particles_per_edge)
     assert particles == len(lattice.particles)
-    assert springs >= len(lattice.springs)
+    assert bound >= lattice.spring_count == len(springs)
     assert surface == len(lattice.surface_quads) + 2
 
     check_surface(lattice, vertices, units)
@@ -104,7 +105,7 @@ def test_cube_of_8_has_the_known_counts() -> None:
     lattice, _ = build_on_grid(np.ones((1, 1, 1), bool), 8)
     # n^3 particles; 3 n^2 (n-1) structural, 6 n (n-1)^2 and 4 (n-1)^3 shear, 3 n^2 (n-2) bend springs.
     assert len(lattice.particles) == 512
-    assert np.bincount(lattice.spring_kinds).tolist() == [1344, 2352, 1372, 1152]
+    assert np.bincount(lattice.springs()[1]).tolist() == [1344, 2352, 1372, 1152]
 
 
 @pytest.mark.parametrize("particles_per_edge", [2, 3])
@@ -140,7 +141,8 @@ def test_only_faces_join_cubes(offset: tuple[int, int, int], shared: int) -> Non
     lattice, _ = build_on_grid(cells)
     assert len(lattice.particles) == 16 - shared
     reached = {0}
-    while grown := {int(p) for s in lattice.springs if reached & set(s.tolist()) for p in s} - reached:
+    springs, _ = lattice.springs()
+    while grown := {int(p) for s in springs if reached & set(s.tolist()) for p in s} - reached:
         reached |= grown
     assert len(reached) == (12 if shared else 8)
 
@@ -152,7 +154,7 @@ def test_many_particles_per_edge_are_a_finer_grid(particles_per_edge: int) -> No
     coarse, vertices = build_on_grid(cells, particles_per_edge)
     fine, fine_vertices = build_on_grid(np.kron(cells, np.ones([particles_per_edge - 1] * 3, bool)).astype(bool))
     np.testing.assert_array_equal(vertices, fine_vertices)
-    for field in ("springs", "spring_kinds", "cell_counts", "surface_particles", "surface_quads"):
+    for field in ("spans", "cell_counts", "surface_particles", "surface_quads"):
         np.testing.assert_array_equal(getattr(coarse, field), getattr(fine, field))
     assert coarse.unit == fine.unit
 
@@ -167,7 +169,7 @@ def test_spring_bound_is_close_for_a_solid() -> None:
     """Bound the springs of a solid of 8^3 cubes within 10 %."""
     cells = np.ones((8, 8, 8), bool)
     lattice, _ = build_on_grid(cells)
-    assert len(lattice.springs) <= count_lattice(cells)[1] <= 1.1 * len(lattice.springs)
+    assert lattice.spring_count <= count_lattice(cells)[1] <= 1.1 * lattice.spring_count
 
 
 def test_corner_table_lists_connected_cells() -> None:
@@ -189,18 +191,19 @@ def expand(spans: np.ndarray) -> Counter[tuple[int, int, int]]:
     return Counter((int(i) + s, int(j) + s, int(kind)) for i, j, count, kind in spans for s in range(count))
 
 
-def test_spans_expand_to_the_springs() -> None:
-    """Find every spring in the spans once, at most MAX_SPAN of them in each."""
+def test_spans_are_long_and_in_order() -> None:
+    """Find spans by ascending first particle, none longer than MAX_SPAN nor shorter than it needs to be."""
     rng = np.random.default_rng(3)
     # The last has runs longer than a span can be.
     for cells in (rng.random((4, 4, 4)) < 0.5, np.ones((1, 1, 1), bool), np.ones((1, 2, 2 * MAX_SPAN + 3), bool)):
         lattice, _ = build_on_grid(cells)
-        spans = springs_to_spans(lattice.springs, lattice.spring_kinds)
+        spans = lattice.spans
         assert 1 <= spans[:, 2].min() <= spans[:, 2].max() <= MAX_SPAN
-        springs = zip(*lattice.springs.T.tolist(), lattice.spring_kinds.tolist(), strict=True)
-        assert expand(spans) == Counter(springs)
         assert (np.diff(spans[:, 0]) >= 0).all()
-    assert spans[:, 2].max() == MAX_SPAN
+        ends, kinds = lattice.springs()
+        assert expand(spans) == Counter(zip(*ends.T.tolist(), kinds.tolist(), strict=True))
+    # Rows of 132 particles along z, 6 of them.
+    assert sorted(spans[spans[:, 1] - spans[:, 0] == 1, 2]) == [3] * 6 + [MAX_SPAN] * 12
 
 
 def test_spans_of_a_model_stay_within_bodies() -> None:
@@ -213,7 +216,8 @@ def test_spans_of_a_model_stay_within_bodies() -> None:
     for number, grid in enumerate(grids):
         lattice, _ = build_on_grid(grid)
         assert simulator.model.bodies[number].particles == slice(first, first + len(lattice.particles))
-        for (i, j), kind in zip(lattice.springs.tolist(), lattice.spring_kinds.tolist(), strict=True):
+        ends, kinds = lattice.springs()
+        for (i, j), kind in zip(ends.tolist(), kinds.tolist(), strict=True):
             expected[first + i, first + j, 4 * number + kind] += 1
         first += len(lattice.particles)
     assert expand(simulator.model.spans.numpy()) == expected

@@ -12,7 +12,7 @@ from worlds import make_material, make_scene, make_voxels
 
 from warpjelly.kernels import springs
 from warpjelly.lattice import build_lattice
-from warpjelly.model import PRECISIONS, spring_classes, springs_to_spans
+from warpjelly.model import PRECISIONS, spring_classes
 from warpjelly.scene import Material
 from warpjelly.simulator import Simulator
 
@@ -211,10 +211,9 @@ def test_lattices_match_the_reference(precision: str, device: str) -> None:
     """Add the forces of a strained random lattice."""
     rng = np.random.default_rng(5)
     lattice = build_lattice(rng.random((3, 3, 3)) < 0.6, origin=np.zeros(3), cell_size=0.2, particles_per_edge=3)
-    spans = springs_to_spans(lattice.springs, lattice.spring_kinds)
     x = lattice.particles + rng.normal(scale=0.02, size=lattice.particles.shape)
     classes = spring_classes(Material.model_validate(make_material(300.0, 0.5)), lattice)
-    check_kernels(x, rng.normal(size=x.shape), spans, classes, precision, device)
+    check_kernels(x, rng.normal(size=x.shape), lattice.spans, classes, precision, device)
 
 
 @pytest.mark.parametrize("kind", [0, 1, 2, 3])
@@ -242,22 +241,23 @@ def test_forces_of_a_body_match_the_laws(law: str, device: str) -> None:
     v = simulator.velocities
     lattice = build_lattice(np.ones((2, 1, 1), bool), origin=[-0.3, -0.15, -0.15], cell_size=0.3, particles_per_edge=3)
     np.testing.assert_allclose(simulator.positions, lattice.particles, rtol=0, atol=EPSILON["float64"])
-    rest = 0.15 * np.array([1, 2**0.5, 3**0.5, 2])[lattice.spring_kinds]
-    k, d = np.array([constants[n] for n in ("structural", "shear", "shear", "bend")])[lattice.spring_kinds].T
+    ends, kinds = lattice.springs()
+    rest = 0.15 * np.array([1, 2**0.5, 3**0.5, 2])[kinds]
+    k, d = np.array([constants[n] for n in ("structural", "shear", "shear", "bend")])[kinds].T
     x = lattice.particles * 1.25
     simulator.state.x.assign(np.ascontiguousarray(x.T))
     v += x * [[3.0, 2.0, 1.0]]
     simulator.state.v.assign(np.ascontiguousarray(v.T))
     simulator.step()
-    offset = x[lattice.springs[:, 1]] - x[lattice.springs[:, 0]]
+    offset = x[ends[:, 1]] - x[ends[:, 0]]
     length = np.linalg.norm(offset, axis=1)
     n = offset / length[:, None]
-    approach = ((v[lattice.springs[:, 1]] - v[lattice.springs[:, 0]]) * n).sum(axis=1)
+    approach = ((v[ends[:, 1]] - v[ends[:, 0]]) * n).sum(axis=1)
     # The laws as they are written, not one by the other.
     pull = k * (length / rest - 1) + d * approach / rest if law == "strain" else k * (length - rest) + d * approach
     expected = np.zeros_like(x)
-    np.add.at(expected, lattice.springs[:, 0], pull[:, None] * n)
-    np.add.at(expected, lattice.springs[:, 1], -pull[:, None] * n)
+    np.add.at(expected, ends[:, 0], pull[:, None] * n)
+    np.add.at(expected, ends[:, 1], -pull[:, None] * n)
     # Up to 17 springs at a particle, each wrong by ROUND_OFF of its parts.
     scale = 17 * np.abs(k / rest * (length + rest) + d / rest * np.abs(approach)).max()
     np.testing.assert_allclose(simulator.forces, expected, rtol=0, atol=ROUND_OFF["float64"] * scale)

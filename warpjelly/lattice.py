@@ -1,4 +1,4 @@
-"""Occupancy grid -> particles, springs and surface of one body, in NumPy.
+"""Occupancy grid -> particles, springs and surface of one body.
 
 Cubes that share a face share that face's particles; cubes that only touch along an edge or in a corner stay apart. One
 rule does it: every corner of every occupied unit cell belongs to a particle, and at a grid vertex the cells that are
@@ -16,13 +16,36 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import warp as wp
 
-# Kinds of spring classes, in order: rest lengths 1, sqrt(2), sqrt(3) and 2 unit cells.
-STRUCTURAL, FACE_SHEAR, BODY_SHEAR, BEND = range(4)
+from warpjelly.kernels.lattices import (
+    BEND,
+    BODY_SHEAR,
+    CELLS_SHIFT,
+    FACE_SHEAR,
+    KIND_SHIFT,
+    LABEL_COUNT,
+    STRUCTURAL,
+    Grid,
+    find_faces,
+    find_patterns,
+    find_spans,
+    place_particles,
+)
+from warpjelly.kernels.springs import MAX_SPAN
+
+from .device import start_warp
+
+# Rest lengths of the four kinds of springs, in unit cells.
 REST_LENGTHS = np.sqrt([1.0, 2.0, 3.0, 4.0])
 
-# The 13 directions of springs within a unit cell: one of each opposite pair, by kind.
-DIRECTIONS = [(dx, dy, dz) for dx in (-1, 0, 1) for dy in (-1, 0, 1) for dz in (-1, 0, 1) if (dx, dy, dz) > (0, 0, 0)]
+# The 13 directions of springs within a unit cell, one of each opposite pair, kind by kind; then those of bend springs.
+DIRECTIONS = sorted(
+    [(dx, dy, dz) for dx in (-1, 0, 1) for dy in (-1, 0, 1) for dz in (-1, 0, 1) if (dx, dy, dz) > (0, 0, 0)],
+    key=lambda direction: np.abs(direction).sum(),
+)
+DIRECTIONS += DIRECTIONS[:3]
+KINDS = np.repeat([STRUCTURAL, FACE_SHEAR, BODY_SHEAR, BEND], [3, 6, 4, 3])
 # Corners of a cell as (x, y, z) bits; a corner's number is 4 x + 2 y + z. Cells around a vertex are numbered alike.
 CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
@@ -48,13 +71,12 @@ class Lattice:
 
     particles: np.ndarray
     """Rest positions, float64 [particle_count, 3], m."""
-    springs: np.ndarray
-    """Both ends, int32 [spring_count, 2], kind by kind."""
-    spring_classes: np.ndarray
-    """Row of each spring in ``classes``, int [spring_count]."""
+    spans: np.ndarray
+    """Springs (i, j), (i + 1, j + 1), ... of one class as (i, j, count, class), by ascending i, at most MAX_SPAN each,
+    int32 [span_count, 4]."""
     classes: SpringClasses
     cell_counts: np.ndarray
-    """How many occupied unit cells share each particle, 1 to 8, int32 [particle_count]."""
+    """How many occupied unit cells share each particle, 1 to 8, uint8 [particle_count]."""
     unit: float
     """Edge of a unit cell, m; without cells, the shortest rest length."""
     surface_particles: np.ndarray
@@ -66,9 +88,20 @@ class Lattice:
     """Whether the faces are seen from both sides."""
 
     @property
-    def spring_kinds(self) -> np.ndarray:
-        """STRUCTURAL, FACE_SHEAR, BODY_SHEAR or BEND, int [spring_count]."""
-        return self.classes.kinds[self.spring_classes]
+    def spring_count(self) -> int:
+        """Number of springs."""
+        return int(self.spans[:, 2].sum(dtype=np.int64))
+
+    def springs(self) -> tuple[np.ndarray, np.ndarray]:
+        """Take the spans apart: both ends of each spring, int32 [spring_count, 2], and its class, int32 [spring_count].
+
+        It takes some ten times the memory of the lattice itself.
+        """
+        counts = self.spans[:, 2]
+        place = np.arange(self.spring_count) - np.repeat(np.cumsum(counts, dtype=np.int64) - counts, counts)
+        ends = np.repeat(self.spans[:, :2], counts, axis=0)
+        ends += place[:, None].astype(np.int32)
+        return ends, np.repeat(self.spans[:, 3], counts)
 
 
 def build_lattice(
@@ -83,27 +116,34 @@ def build_lattice(
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
         weighted: tell springs apart by how many cells contain them, too; otherwise there are four classes, the kinds.
     """
-    refinement = particles_per_edge - 1
-    units = cells
-    for axis in range(3):
-        units = np.repeat(units, refinement, axis=axis)
-    unit = cell_size / refinement
-    corner_particles, particles, cell_counts = _share_corners(units)
-    springs, spring_classes, classes = _connect(units, corner_particles, len(particles), unit, weighted)
-    surface_particles, surface_quads = _skin(units, corner_particles, len(particles))
+    unit = cell_size / (particles_per_edge - 1)
+    grid, particle_count = _number_particles(cells, particles_per_edge - 1)
+    vertices = wp.empty(particle_count, dtype=wp.vec3i, device="cpu")
+    cell_counts = wp.zeros(particle_count, dtype=wp.uint8, device="cpu")
+    _launch(place_particles, grid.row_low.shape, [grid], [vertices, cell_counts])
+    particles = vertices.numpy().astype(float)
+    # In place: at this size each temporary counts.
+    particles *= unit
+    particles += origin
+    spans, classes = _connect(grid, unit, weighted)
+    surface_particles, surface_quads = _skin(grid, particle_count)
     return Lattice(
-        particles=np.asarray(origin, float) + unit * particles,
-        springs=springs,
-        spring_classes=spring_classes,
+        particles=particles,
+        spans=spans,
         classes=classes,
-        cell_counts=cell_counts,
+        cell_counts=cell_counts.numpy(),
         unit=unit,
         surface_particles=surface_particles,
         surface_quads=surface_quads,
     )
 
 
-def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[int, int, int]:
+def order_spans(spans: np.ndarray) -> np.ndarray:
+    """Return spans by ascending first particle: its springs, close together in time, find it still in the cache."""
+    return spans[np.argsort(spans[:, 0], kind="stable")]
+
+
+def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[int, int, int, int]:
     """Count what ``build_lattice`` would make without making it, from the corners, edges and faces of the jelly cubes.
 
     Args:
@@ -112,7 +152,7 @@ def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[in
 
     Returns:
         The number of particles, exact; an upper bound of the number of springs, close for thick bodies; about the
-        number of points on the surface.
+        number of spans of springs and of points on the surface.
     """
     cubes = int(np.count_nonzero(cells))
     vertices = int(corner_labels()[1][_vertex_patterns(cells)].sum(dtype=np.int64))
@@ -132,7 +172,10 @@ def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[in
     # Bend springs join consecutive structural ones, so there are fewer of them.
     # Each face of a cube is shared or exposed, and a closed surface of quads has about as many points as faces.
     exposed = 2 * faces - 6 * cubes
-    return particles, 2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3, exposed * n**2 + 2
+    # Each of the directions of springs makes about one span of each row of unit cells, or more where it is long.
+    rows = np.count_nonzero(cells[:, :, 0]) + np.count_nonzero(cells[:, :, 1:] & ~cells[:, :, :-1])
+    spans = len(DIRECTIONS) * (rows * n**2 + cubes * n**3 // MAX_SPAN)
+    return particles, 2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3, spans, exposed * n**2 + 2
 
 
 @functools.cache
@@ -171,152 +214,89 @@ def _vertex_patterns(units: np.ndarray) -> np.ndarray:
     return pattern
 
 
-def _share_corners(units: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Number the particles.
+def _launch(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
+    """Launch a kernel that builds, always on the CPU."""
+    wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu")
 
-    Returns:
-        The particle of each corner of each unit cell, int32 [8, nx, ny, nz], -1 in empty cells; the grid coordinates of
-        each particle, int32 [particle_count, 3]; the number of cells that share it, int32 [particle_count].
-    """
-    nx, ny, nz = units.shape
+
+def _number_particles(cells: np.ndarray, refinement: int) -> tuple[Grid, int]:
+    """Return the grid of the kernels, with its particles in scan order, and how many there are."""
+    start_warp()
     labels, counts = corner_labels()
-    pattern = _vertex_patterns(units)
-    count_at = counts[pattern]
-    first = np.cumsum(count_at, dtype=np.int32).reshape(count_at.shape) - count_at.astype(np.int32)
-    vertices = np.argwhere(count_at > 0).astype(np.int32)
-    particles = np.repeat(vertices, count_at[count_at > 0], axis=0)
+    nz = cells.shape[2]
+    occupied = cells.any(axis=2)
+    # From the first to the last occupied cell of each row of cells; an empty row begins above where it ends.
+    lowest = np.where(occupied, cells.argmax(axis=2), nz)
+    highest = np.where(occupied, nz - cells[:, :, ::-1].argmax(axis=2), 0)
+    # A row of vertices has those of the four rows of cells around it.
+    low = refinement * _reduce_around(np.minimum, lowest, refinement, nz)
+    high = refinement * _reduce_around(np.maximum, highest, refinement, 0) + 1
+    lengths = np.where(high > low, high - low, 0)
+    vertex_count = int(lengths.sum())
 
-    corner_particles = np.full((8, nx, ny, nz), -1, np.int32)
-    for number, (x, y, z) in enumerate(CORNERS):
-        at = (slice(x, x + nx), slice(y, y + ny), slice(z, z + nz))
-        # The cell that has the vertex at its corner (x, y, z) lies on the opposite side of it.
-        label = labels[pattern[at], 7 - number]
-        corner_particles[number] = np.where(units, first[at] + label, -1)
-    cell_counts = np.bincount(corner_particles[corner_particles >= 0], minlength=len(particles)).astype(np.int32)
-    return corner_particles, particles, cell_counts
+    def array(data: np.ndarray, dtype: Any) -> wp.array:
+        return wp.array(data, dtype=dtype, device="cpu")
+
+    grid = Grid()
+    grid.cells = array(cells, wp.uint8)
+    grid.refinement = refinement
+    grid.labels = array(labels, wp.uint8)
+    grid.row_start = array((np.cumsum(lengths) - lengths.ravel()).reshape(lengths.shape), wp.int32)
+    grid.row_low, grid.row_high = array(low, wp.int32), array(low + lengths, wp.int32)
+    grid.patterns = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
+    grid.first = wp.empty(vertex_count, dtype=wp.int32, device="cpu")
+    _launch(find_patterns, lengths.shape, [grid, array(counts, wp.uint8)], [])
+    # From how many particles each vertex has to how many there are before it.
+    first = grid.first.numpy()
+    last = int(first[-1])
+    first[1:] = np.cumsum(first[:-1])
+    first[0] = 0
+    return grid, int(first[-1]) + last
 
 
-def _connect(
-    units: np.ndarray, corner_particles: np.ndarray, particle_count: int, unit: float, weighted: bool
-) -> tuple[np.ndarray, np.ndarray, SpringClasses]:
-    """Return the springs, int32 [spring_count, 2], kind by kind; the class of each, int [spring_count]; the classes."""
-    springs: list[list[np.ndarray]] = [[], [], [], []]
-    labels: list[list[np.ndarray]] = [[], [], [], []]
-    for direction in DIRECTIONS:
-        kind = int(np.abs(direction).sum()) - 1
-        found, counts = _springs_along(direction, units.shape, corner_particles, weighted)
-        springs[kind].append(found)
-        labels[kind].append(_label(kind, counts))
-        if kind == STRUCTURAL:
-            under = _bend_springs(found, particle_count)
-            springs[BEND].append(np.stack([found[under[:, 0], 0], found[under[:, 1], 1]], axis=1))
-            if weighted:
-                fewer = counts[under].min(axis=1)
-                labels[BEND].append(_label(BEND, fewer))
-                for end in (0, 1):
-                    over = np.bincount(under[:, end], fewer, minlength=len(found))
-                    labels[kind][-1] += over.astype(np.uint16)
-    ends = np.concatenate([part for parts in springs for part in parts])
-    if not weighted:
-        kinds = np.repeat(np.arange(4, dtype=np.uint8), [sum(map(len, parts)) for parts in springs])
-        return ends, kinds, SpringClasses(np.arange(4), REST_LENGTHS * unit)
-    parts = [part for parts in labels for part in parts]
-    used = np.zeros(1 << 10, bool)
-    for part in parts:
-        used |= np.bincount(part, minlength=len(used)) > 0
-    row = (np.cumsum(used) - 1).astype(np.uint8)
+def _reduce_around(reduce: np.ufunc, rows: np.ndarray, refinement: int, empty: int) -> np.ndarray:
+    """Combine what is known of each row of cells, int [nx, ny], into rows of vertices, [refinement nx + 1, ...]."""
+    for axis in (0, 1):
+        rows = np.repeat(rows, refinement, axis=axis)
+        rows = np.pad(rows, [(1, 1) if other == axis else (0, 0) for other in (0, 1)], constant_values=empty)
+        low, high = (np.take(rows, np.arange(rows.shape[axis] - 1) + side, axis=axis) for side in (0, 1))
+        rows = reduce(low, high)
+    return rows
+
+
+def _connect(grid: Grid, unit: float, weighted: bool) -> tuple[np.ndarray, SpringClasses]:
+    """Return the springs as spans, int32 [span_count, 4], and their classes."""
+    directions = wp.array(DIRECTIONS, dtype=wp.vec3i, device="cpu")
+    kinds = wp.array(KINDS, dtype=wp.int32, device="cpu")
+    spans = order_spans(_collect(find_spans, len(KINDS), [grid, directions, kinds, weighted]))
+    used = np.zeros(LABEL_COUNT, bool)
+    used[np.arange(4) << KIND_SHIFT] = not weighted
+    used[spans[:, 3]] = True
+    spans[:, 3] = (np.cumsum(used, dtype=np.int32) - 1)[spans[:, 3]]
     label = np.flatnonzero(used)
-    classes = SpringClasses(label >> 8, REST_LENGTHS[label >> 8] * unit, label >> 5 & 7, label & 31)
-    return ends, np.concatenate([row[part] for part in parts]), classes
+    kinds_used = label >> KIND_SHIFT
+    rest_lengths = REST_LENGTHS[kinds_used] * unit
+    if not weighted:
+        return spans, SpringClasses(kinds_used, rest_lengths)
+    cells = label >> CELLS_SHIFT & (1 << KIND_SHIFT - CELLS_SHIFT) - 1
+    return spans, SpringClasses(kinds_used, rest_lengths, cells, label & (1 << CELLS_SHIFT) - 1)
 
 
-def _label(kind: int, cells: np.ndarray) -> np.ndarray:
-    """Return one number for the kind and the cells of springs, uint16; its last 5 bits are left for the bend springs.
-
-    At most 4 cells contain a spring, and at most 4 bend springs, each with at most 4 cells, run over a structural one.
-    """
-    return np.uint16(kind << 8) | cells.astype(np.uint16) << np.uint16(5)
-
-
-def _springs_along(
-    direction: tuple[int, int, int], shape: tuple[int, ...], corner_particles: np.ndarray, counted: bool
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the springs in one direction, int32 [count, 2], in scan order of the vertices they start from.
-
-    Up to four cells hold a spring's place, and each names its own pair of particles: mostly the same one. The second
-    array says how many cells do, uint8 [count]; it is empty unless ``counted``.
-    """
-    nx, ny, nz = shape
-    candidates: list[tuple[Any, np.ndarray, np.ndarray]] = []
-    for number, corner in enumerate(CORNERS):
-        target = (corner[0] + direction[0], corner[1] + direction[1], corner[2] + direction[2])
-        if target in CORNERS:
-            at = tuple(slice(c, c + n) for c, n in zip(corner, shape, strict=True))
-            candidates.append((at, corner_particles[number], corner_particles[CORNERS.index(target)]))
-    pairs = np.full((nx + 1, ny + 1, nz + 1, len(candidates), 2), -1, np.int32)
-    counts = np.ones(pairs.shape[:-1] if counted else 0, np.uint8)
-    for slot, (at, start, end) in enumerate(candidates):
-        repeated = np.zeros(shape, bool)
-        for earlier in range(slot):
-            same = (pairs[(*at, earlier, 0)] == start) & (pairs[(*at, earlier, 1)] == end)
-            repeated |= same
-            if counted:
-                counts[(*at, earlier)] += same
-        pairs[(*at, slot, 0)] = np.where(repeated, -1, start)
-        pairs[(*at, slot, 1)] = np.where(repeated, -1, end)
-    flat = pairs.reshape(-1, 2)
-    found = flat[:, 0] >= 0
-    return flat[found], counts.reshape(-1)[found] if counted else counts
-
-
-def _bend_springs(structural: np.ndarray, particle_count: int) -> np.ndarray:
-    """Return the pairs of consecutive structural springs along one axis that bend springs span, int32 [count, 2].
-
-    A particle has at most two springs towards one side: where cells that meet in it only along an edge part.
-    """
-    first, second = structural.T
-    number = np.arange(len(structural), dtype=np.int32)
-    following = np.full((particle_count, 2), -1, np.int32)
-    # Written in reverse, the earlier of two springs wins the first column; the other one goes to the second.
-    following[first[::-1], 0] = number[::-1]
-    other = following[first, 0] != number
-    following[first[other], 1] = number[other]
-
-    under = np.full((particle_count, 4, 2), -1, np.int32)
-    ends = np.full((particle_count, 4), -1, np.int32)
-    for slot in range(4):
-        near = following[:, slot // 2]
-        far = np.where(near >= 0, following[second[near], slot % 2], -1)
-        end = np.where(far >= 0, second[far], -1)
-        # Two ways around a gap may lead to the same end; one spring is enough.
-        fresh = (end >= 0) & (end[:, None] != ends[:, :slot]).all(axis=1)
-        ends[fresh, slot] = end[fresh]
-        under[fresh, slot, 0] = near[fresh]
-        under[fresh, slot, 1] = far[fresh]
-    flat = under.reshape(-1, 2)
-    return flat[flat[:, 0] >= 0]
-
-
-def _skin(units: np.ndarray, corner_particles: np.ndarray, particle_count: int) -> tuple[np.ndarray, np.ndarray]:
+def _skin(grid: Grid, particle_count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the surface particles, int32 [point_count], and the outward quads over them, int32 [face_count, 4]."""
-    padded = np.pad(units, 1)
-    faces = []
-    for axis in range(3):
-        # The other two axes, in the order that makes their cross product point along +axis.
-        u, w = (axis + 1) % 3, (axis + 2) % 3
-        for side in (0, 1):
-            beyond = [slice(1, -1)] * 3
-            beyond[axis] = slice(2, None) if side else slice(0, -2)
-            exposed = units & ~padded[tuple(beyond)]
-            around = [(0, 0), (1, 0), (1, 1), (0, 1)] if side else [(0, 0), (0, 1), (1, 1), (1, 0)]
-            corners = []
-            for along_u, along_w in around:
-                bits = [0, 0, 0]
-                bits[axis], bits[u], bits[w] = side, along_u, along_w
-                corners.append(corner_particles[CORNERS.index((bits[0], bits[1], bits[2]))][exposed])
-            faces.append(np.stack(corners, axis=1))
-    quads = np.concatenate(faces)
+    quads = _collect(find_faces, 6, [grid])
     on_surface = np.zeros(particle_count, bool)
     on_surface[quads] = True
     point = np.cumsum(on_surface, dtype=np.int32) - np.int32(1)
-    return np.flatnonzero(on_surface).astype(np.int32), point[quads].astype(np.int32)
+    return np.flatnonzero(on_surface).astype(np.int32), point[quads]
+
+
+def _collect(kernel: wp.Kernel, dim: int, inputs: list[Any]) -> np.ndarray:
+    """Return what the threads of a kernel find one after another, int32 [count, 4]: count first, then write."""
+    starts, counts = (wp.zeros(dim, dtype=wp.int32, device="cpu") for _ in range(2))
+    _launch(kernel, dim, [*inputs, starts], [wp.empty(0, dtype=wp.vec4i, device="cpu"), counts])
+    total = np.cumsum(counts.numpy())
+    starts.assign(total - counts.numpy())
+    found = wp.empty(int(total[-1]), dtype=wp.vec4i, device="cpu")
+    _launch(kernel, dim, [*inputs, starts], [found, counts])
+    return found.numpy()

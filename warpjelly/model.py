@@ -10,9 +10,10 @@ import numpy as np
 import warp as wp
 
 from warpjelly.kernels import bounds, contacts, fields, springs
+from warpjelly.kernels.lattices import BEND, BODY_SHEAR, FACE_SHEAR, STRUCTURAL
 
 from .errors import InputError
-from .lattice import BEND, BODY_SHEAR, FACE_SHEAR, STRUCTURAL, Lattice
+from .lattice import Lattice
 from .plan import Plan
 from .scene import (
     DEFAULT_PARTICLE_MASS,
@@ -174,8 +175,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         masses.append(mass)
         inverse_masses.append(np.where(pinned, 0.0, 1.0 / mass))
         charges.append(np.full(count, body.charge))
-        body_spans = springs_to_spans(lattice.springs, lattice.spring_classes)
-        spans.append(body_spans + np.array([particle_count, particle_count, 0, class_count], np.int32))
+        spans.append(lattice.spans + np.array([particle_count, particle_count, 0, class_count], np.int32))
         classes.append(spring_classes(material, lattice))
         chunks.append(np.arange(particle_count, particle_count + count, CHUNK_SIZE, dtype=np.int32))
         chunk_bodies.append(np.full(len(chunks[-1]), number, np.int32))
@@ -194,7 +194,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         )
         particle_count += count
         point_count += points
-        spring_count += len(lattice.springs)
+        spring_count += lattice.spring_count
         class_count += len(classes[-1])
 
     def array(data: Any, dtype: Any) -> wp.array:
@@ -263,29 +263,6 @@ def launch_spring_forces(
         outputs=[f, losses],
         device=model.spans.device,
     )
-
-
-def springs_to_spans(ends: np.ndarray, classes: np.ndarray) -> np.ndarray:
-    """Join springs whose two ends both advance by one, int32 [span_count, 4] = (i, j, count, class).
-
-    Args:
-        ends: particles of each spring, int32 [spring_count, 2].
-        classes: class of each spring, int [spring_count].
-    """
-    if len(ends) == 0:
-        return np.zeros((0, 4), np.int32)
-    first, second = ends.T
-    breaks = np.flatnonzero((np.diff(first) != 1) | (np.diff(second) != 1) | (np.diff(classes) != 0)) + 1
-    start = np.concatenate([[0], breaks])
-    length = np.diff(np.append(start, len(ends)))
-    # Long runs are cut into pieces of MAX_SPAN.
-    pieces = -(-length // springs.MAX_SPAN)
-    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-    begin = np.repeat(start, pieces) + springs.MAX_SPAN * piece
-    end = np.minimum(begin + springs.MAX_SPAN, np.repeat(start + length, pieces))
-    spans = np.stack([first[begin], second[begin], end - begin, classes[begin]], axis=1).astype(np.int32)
-    # The springs of a particle close together in time find it still in the cache.
-    return spans[np.argsort(spans[:, 0], kind="stable")]
 
 
 def spring_classes(material: Material, lattice: Lattice) -> np.ndarray:
@@ -427,7 +404,8 @@ def _skin(scene: Scene, lattices: Sequence[Lattice], real: type, device: str) ->
         members = np.flatnonzero(on_skin)
         member = np.cumsum(on_skin) - 1 + count
         # Springs within the skin, from both ends, sorted by the first.
-        inner = lattice.springs[on_skin[lattice.springs].all(axis=1)]
+        springs, _ = lattice.springs()
+        inner = springs[on_skin[springs].all(axis=1)]
         ends = member[np.concatenate([inner, inner[:, ::-1]])]
         ends = ends[np.argsort(ends[:, 0], kind="stable")]
         degree = np.bincount(ends[:, 0] - count, minlength=len(members))

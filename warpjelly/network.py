@@ -7,7 +7,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from .lattice import BEND, FACE_SHEAR, STRUCTURAL, Lattice, SpringClasses
+from warpjelly.kernels.lattices import BEND, FACE_SHEAR, STRUCTURAL
+from warpjelly.kernels.springs import MAX_SPAN
+
+from .lattice import Lattice, SpringClasses, order_spans
 
 # Structural, shear and bend springs in the order of the scene file; a body diagonal is a thing of cells.
 _KINDS = (STRUCTURAL, FACE_SHEAR, BEND)
@@ -37,10 +40,9 @@ def build_network(
     lone = np.setdiff1d(np.arange(len(particles)), ends)
     return Lattice(
         particles=particles,
-        springs=ends,
-        spring_classes=rows.reshape(-1),
+        spans=_join_runs(ends, rows.reshape(-1)),
         classes=SpringClasses(table[:, 0].astype(int), table[:, 1]),
-        cell_counts=np.zeros(len(particles), np.int32),
+        cell_counts=np.zeros(len(particles), np.uint8),
         unit=float(rest.min()) if len(rest) else 1.0,
         surface_particles=np.append(ends.ravel(), np.repeat(lone, 2)).astype(np.int32),
         surface_quads=np.zeros((0, 4), np.int32),
@@ -68,12 +70,35 @@ def build_cloth(size: tuple[float, float], particles: tuple[int, int]) -> Lattic
     corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
     return Lattice(
         particles=np.stack([*np.meshgrid(x, [0.0], z, indexing="ij")], axis=-1).reshape(-1, 3),
-        springs=np.concatenate([np.stack([first.ravel(), second.ravel()], axis=1) for _, _, first, second in families]),
-        spring_classes=np.repeat(np.arange(len(families), dtype=np.uint8), [first.size for _, _, first, _ in families]),
+        spans=_join_runs(
+            np.concatenate([np.stack([first.ravel(), second.ravel()], axis=1) for _, _, first, second in families]),
+            np.repeat(np.arange(len(families)), [first.size for _, _, first, _ in families]),
+        ),
         classes=SpringClasses(np.array([kind for kind, *_ in families]), np.array([rest for _, rest, *_ in families])),
-        cell_counts=np.zeros(number.size, np.int32),
+        cell_counts=np.zeros(number.size, np.uint8),
         unit=min(along_x, along_z),
         surface_particles=number.ravel(),
         surface_quads=np.stack([corner.ravel() for corner in corners], axis=1),
         double_sided=True,
     )
+
+
+def _join_runs(ends: np.ndarray, classes: np.ndarray) -> np.ndarray:
+    """Join springs whose two ends both advance by one, int32 [span_count, 4] = (i, j, count, class).
+
+    Args:
+        ends: particles of each spring, int32 [spring_count, 2].
+        classes: class of each spring, int [spring_count].
+    """
+    if len(ends) == 0:
+        return np.zeros((0, 4), np.int32)
+    first, second = ends.T
+    breaks = np.flatnonzero((np.diff(first) != 1) | (np.diff(second) != 1) | (np.diff(classes) != 0)) + 1
+    start = np.concatenate([[0], breaks])
+    length = np.diff(np.append(start, len(ends)))
+    # Long runs are cut into pieces of MAX_SPAN.
+    pieces = -(-length // MAX_SPAN)
+    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    begin = np.repeat(start, pieces) + MAX_SPAN * piece
+    end = np.minimum(begin + MAX_SPAN, np.repeat(start + length, pieces))
+    return order_spans(np.stack([first[begin], second[begin], end - begin, classes[begin]], axis=1).astype(np.int32))

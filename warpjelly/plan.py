@@ -22,15 +22,14 @@ log = logging.getLogger("warpjelly")
 MAX_ROW_BYTES = 2**31 - 1
 BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 
-# Bytes at the peak of building and running a scene, as measured: within 5 % for a solid cube of 128^3 particles.
+# Bytes at the peak of building and running a scene, as measured: within 5 % for solid cubes of 128^3 and 200^3.
 BYTES_AT_REST = 290e6
-BYTES_PER_UNIT_CELL = 60
-BYTES_PER_PARTICLE = {"float32": 80, "float64": 100}
-BYTES_PER_SPRING = 20
+BYTES_PER_PARTICLE = {"float32": 240, "float64": 280}
+BYTES_PER_SPAN = 64
 # Points, normals, colours and forces of a surface point at a frame; all of them are in memory until the stage is whole.
 BYTES_PER_SURFACE_SAMPLE = 36
-# Scan conversion holds one byte per cell three times.
-BYTES_PER_GRID_CELL = 4
+# Scan conversion holds one byte per cell three times, counting what follows from them some more.
+BYTES_PER_GRID_CELL = 6
 
 
 @dataclass(frozen=True)
@@ -43,12 +42,14 @@ class BodyPlan:
     particle_count: int
     spring_bound: int
     """No more springs than this."""
-    surface_bound: int
+    span_estimate: int
+    """About as many spans of springs as this."""
+    surface_estimate: int
     """About as many points on the surface as this."""
     voxel_count: int = 0
     """Number of jelly cubes."""
     grid_size: int = 0
-    """Number of unit cells of its grid, occupied or not."""
+    """Number of cells of its grid, occupied or not."""
 
 
 @dataclass(frozen=True)
@@ -76,13 +77,12 @@ class Plan:
     @property
     def memory_bytes(self) -> int:
         """Estimated peak of memory, bytes."""
-        unit_cells = max(plan.grid_size for plan in self.bodies)
         return int(
             BYTES_AT_REST
-            + BYTES_PER_UNIT_CELL * unit_cells
+            + BYTES_PER_GRID_CELL * max(plan.grid_size for plan in self.bodies)
             + BYTES_PER_PARTICLE[self.scene.solver.precision] * self.particle_count
-            + BYTES_PER_SPRING * self.spring_bound
-            + BYTES_PER_SURFACE_SAMPLE * self.scene.frame_count * sum(plan.surface_bound for plan in self.bodies)
+            + BYTES_PER_SPAN * sum(plan.span_estimate for plan in self.bodies)
+            + BYTES_PER_SURFACE_SAMPLE * self.scene.frame_count * sum(plan.surface_estimate for plan in self.bodies)
         )
 
 
@@ -105,10 +105,11 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
     if isinstance(body, NetworkBody):
         build = partial(build_network, body.points, body.springs(), body.rest_lengths)
         springs = sum(map(len, body.springs()))
-        return BodyPlan(body, build, len(body.points), springs, 2 * springs)
+        return BodyPlan(body, build, len(body.points), springs, springs, 2 * springs)
     if isinstance(body, ClothBody):
         particles = body.particles[0] * body.particles[1]
-        return BodyPlan(body, partial(build_cloth, body.size, body.particles), particles, 6 * particles, particles)
+        build = partial(build_cloth, body.size, body.particles)
+        return BodyPlan(body, build, particles, 6 * particles, 6 * particles, particles)
     if isinstance(body, CubeBody):
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
@@ -127,8 +128,7 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         weighted=scene.materials[body.material].law == "young",
     )
     counts = count_lattice(cells, particles_per_edge=per_edge)
-    voxels, unit_cells = int(np.count_nonzero(cells)), cells.size * (per_edge - 1) ** 3
-    return BodyPlan(body, build, *counts, voxels, unit_cells)
+    return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size)
 
 
 def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:

@@ -1,0 +1,351 @@
+"""Particles, springs and faces of a lattice, from its occupied cells.
+
+Vertices of the grid are in rows along z, and of each row only the part that touches cells is stored: vertex (x, y, z)
+has the place ``row_start[x, y] + z - row_low[x, y]``. There it has the pattern of the 8 cells around it (bit
+``4 x + 2 y + z`` for the cell on the (x, y, z) side) and its first particle; a table of 256 patterns says which of the
+particles at a vertex belongs to which cell.
+
+These kernels run on the CPU alone. Those of springs and faces are launched over directions, and each thread walks the
+whole grid in scan order: so springs come in order, and in runs as long as they can be.
+"""
+
+import warp as wp
+
+from .springs import MAX_SPAN
+
+wp.set_module_options({"enable_backward": False})
+
+# Kinds of springs.
+STRUCTURAL = wp.constant(0)
+FACE_SHEAR = wp.constant(1)
+BODY_SHEAR = wp.constant(2)
+BEND = wp.constant(3)
+# What the springs of a class have in common, as one number: kind << 8 | cells << 5 | cells of the bend springs over it.
+# At most 4 cells contain a spring, and at most 4 bend springs, each with at most 4 cells, run over a structural one.
+KIND_SHIFT = wp.constant(8)
+CELLS_SHIFT = wp.constant(5)
+LABEL_COUNT = 4 << KIND_SHIFT
+
+FULL = wp.constant(255)
+NONE = wp.constant(-1)
+
+vec8i = wp.types.vector(8, wp.int32)
+
+
+@wp.struct
+class Grid:
+    """Occupied cells, and the particles around each vertex."""
+
+    cells: wp.array3d(dtype=wp.uint8)  # [nx, ny, nz] occupied jelly cubes
+    refinement: int  # unit cells along the edge of a jelly cube
+    labels: wp.array2d(dtype=wp.uint8)  # [256, 8] particle of each cell around a vertex, from 0; 255 where empty
+    row_start: wp.array2d(dtype=wp.int32)  # [rows_x, rows_y] place of the first vertex of a row that is stored
+    row_low: wp.array2d(dtype=wp.int32)  # [rows_x, rows_y] its z
+    row_high: wp.array2d(dtype=wp.int32)  # [rows_x, rows_y] z after the last
+    patterns: wp.array(dtype=wp.uint8)  # [vertex_count] occupied cells around each vertex
+    first: wp.array(dtype=wp.int32)  # [vertex_count] its first particle
+
+
+@wp.struct
+class Springs:
+    """Springs from one vertex in one direction; up to four cells name one each, and mostly the same one."""
+
+    start: wp.vec4i  # particles; NONE where there is no spring
+    end: wp.vec4i
+    cells: wp.vec4i  # how many cells contain it
+
+
+@wp.struct
+class Bends:
+    """Bend springs from one vertex along one axis."""
+
+    count: int
+    start: vec8i
+    end: vec8i
+    near: vec8i  # which of the springs from the vertex it spans first,
+    far: vec8i  # and which of those from the next vertex then
+    cells: vec8i  # the fewer of the cells of these two
+
+
+@wp.func
+def occupied(grid: Grid, x: int, y: int, z: int):
+    """Say whether a unit cell is occupied; outside of the grid none is."""
+    n = grid.refinement
+    inside = x >= 0 and y >= 0 and z >= 0
+    inside = inside and x < n * grid.cells.shape[0] and y < n * grid.cells.shape[1] and z < n * grid.cells.shape[2]
+    filled = int(0)
+    if inside:
+        filled = int(grid.cells[x / n, y / n, z / n])
+    return filled
+
+
+@wp.func
+def vertex(grid: Grid, x: int, y: int, z: int):
+    """Return the place of a vertex, NONE where no cell touches it."""
+    place = int(NONE)
+    if x >= 0 and y >= 0 and x < grid.row_low.shape[0] and y < grid.row_low.shape[1]:
+        if z >= grid.row_low[x, y] and z < grid.row_high[x, y]:
+            place = grid.row_start[x, y] + z - grid.row_low[x, y]
+    return place
+
+
+@wp.func
+def corner_particle(grid: Grid, place: int, number: int):
+    """Return the particle that a cell has at a vertex of which it is cell ``number``."""
+    return grid.first[place] + int(grid.labels[int(grid.patterns[place]), number])
+
+
+@wp.func
+def is_inner(grid: Grid, place: int):
+    """Say whether a vertex, if there is one at the place, has all 8 cells around it."""
+    return place >= 0 and int(grid.patterns[wp.max(place, 0)]) == FULL
+
+
+@wp.func
+def springs_from(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int):
+    """Return the springs from a vertex in a direction of components -1, 0, 1.
+
+    A cell contains both ends if the vertex is its corner (cx, cy, cz), and the end its corner (cx + dx, ...).
+    """
+    springs = Springs()
+    springs.start = wp.vec4i(NONE, NONE, NONE, NONE)
+    here = vertex(grid, x, y, z)
+    there = vertex(grid, x + dx, y + dy, z + dz)
+    if here >= 0 and there >= 0:
+        found = int(0)
+        for number in range(8):
+            cx = number / 4
+            cy = number / 2 % 2
+            cz = number % 2
+            fits = cx + dx >= 0 and cx + dx <= 1 and cy + dy >= 0 and cy + dy <= 1 and cz + dz >= 0 and cz + dz <= 1
+            # The cell lies on the other side of the vertex than the vertex of it.
+            if fits and (int(grid.patterns[here]) >> (7 - number)) % 2 == 1:
+                start = corner_particle(grid, here, 7 - number)
+                end = corner_particle(grid, there, 7 - number - (4 * dx + 2 * dy + dz))
+                repeated = bool(False)
+                for earlier in range(found):
+                    if springs.start[earlier] == start and springs.end[earlier] == end:
+                        springs.cells[earlier] = springs.cells[earlier] + 1
+                        repeated = True
+                if not repeated:
+                    springs.start[found] = start
+                    springs.end[found] = end
+                    springs.cells[found] = 1
+                    found += 1
+    return springs
+
+
+@wp.func
+def bends_from(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int):
+    """Return the bend springs from a vertex along an axis: they span two structural springs one after the other.
+
+    Two ways around a gap may lead to the same end; one spring is enough.
+    """
+    bends = Bends()
+    near = springs_from(grid, x, y, z, dx, dy, dz)
+    far = springs_from(grid, x + dx, y + dy, z + dz, dx, dy, dz)
+    here = vertex(grid, x, y, z)
+    found = int(0)
+    if here >= 0:
+        for particle in range(grid.first[here], grid.first[here] + 4):
+            for a in range(4):
+                for b in range(4):
+                    if near.start[a] == particle and far.start[b] == near.end[a]:
+                        fresh = bool(True)
+                        for earlier in range(found):
+                            if bends.start[earlier] == particle and bends.end[earlier] == far.end[b]:
+                                fresh = False
+                        if fresh:
+                            bends.start[found] = particle
+                            bends.end[found] = far.end[b]
+                            bends.near[found] = a
+                            bends.far[found] = b
+                            bends.cells[found] = wp.min(near.cells[a], far.cells[b])
+                            found += 1
+    bends.count = found
+    return bends
+
+
+@wp.kernel
+def find_patterns(
+    # In and out:
+    grid: Grid,
+    # In:
+    counts: wp.array(dtype=wp.uint8),
+):
+    """Overwrite the patterns of a row of vertices, and their first particles by how many they have ``counts`` [256]."""
+    x, y = wp.tid()
+    start = grid.row_start[x, y] - grid.row_low[x, y]
+    for z in range(grid.row_low[x, y], grid.row_high[x, y]):
+        pattern = 0
+        for number in range(8):
+            pattern |= occupied(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2) << number
+        grid.patterns[start + z] = wp.uint8(pattern)
+        grid.first[start + z] = wp.int32(counts[pattern])
+
+
+@wp.kernel
+def place_particles(
+    # In:
+    grid: Grid,
+    # Out:
+    vertices: wp.array(dtype=wp.vec3i),
+    cells: wp.array(dtype=wp.uint8),
+):
+    """Overwrite the grid coordinates of the particles of a row, and add the cells that share each."""
+    x, y = wp.tid()
+    start = grid.row_start[x, y] - grid.row_low[x, y]
+    for z in range(grid.row_low[x, y], grid.row_high[x, y]):
+        pattern = int(grid.patterns[start + z])
+        for number in range(8):
+            if (pattern >> number) % 2 == 1:
+                particle = corner_particle(grid, start + z, number)
+                vertices[particle] = wp.vec3i(x, y, z)
+                cells[particle] = cells[particle] + wp.uint8(1)
+
+
+@wp.func
+def bend_cells(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int, slot: int):
+    """Return the sum of the cells of the bend springs over a structural one, given as one of those from a vertex."""
+    total = int(0)
+    after = bends_from(grid, x, y, z, dx, dy, dz)
+    for b in range(after.count):
+        if after.near[b] == slot:
+            total += after.cells[b]
+    before = bends_from(grid, x - dx, y - dy, z - dz, dx, dy, dz)
+    for b in range(before.count):
+        if before.far[b] == slot:
+            total += before.cells[b]
+    return total
+
+
+@wp.func
+def append_spring(spans: wp.array(dtype=wp.vec4i), span: wp.vec4i, at: int, start: int, end: int, label: int):
+    """Lengthen the current span by a spring, or store it at ``at`` and begin another; return it and where it goes."""
+    count = span[2]
+    if count > 0 and count < MAX_SPAN and span[3] == label and start == span[0] + count and end == span[1] + count:
+        span[2] = count + 1
+    else:
+        at = store_span(spans, span, at)
+        span = wp.vec4i(start, end, 1, label)
+    return span, at
+
+
+@wp.func
+def store_span(spans: wp.array(dtype=wp.vec4i), span: wp.vec4i, at: int):
+    """Store a span, unless it is empty or the spans are only counted; return where the next one goes."""
+    if span[2] > 0:
+        if at < spans.shape[0]:
+            spans[at] = span
+        at += 1
+    return at
+
+
+@wp.kernel
+def find_spans(
+    # In:
+    grid: Grid,
+    directions: wp.array(dtype=wp.vec3i),
+    kinds: wp.array(dtype=wp.int32),
+    weighted: bool,
+    starts: wp.array(dtype=wp.int32),
+    # Out:
+    spans: wp.array(dtype=wp.vec4i),
+    counts: wp.array(dtype=wp.int32),
+):
+    """Overwrite the spans (i, j, count, label) of a direction, from its start on, and how many there are.
+
+    Without room for spans, count them alone. Unless weighted, labels tell kinds apart alone.
+    """
+    d = wp.tid()
+    dx = directions[d][0]
+    dy = directions[d][1]
+    dz = directions[d][2]
+    kind = kinds[d]
+    reach = wp.where(kind == BEND, 2, 1)
+    # Deep inside, which is nearly everywhere, there is one spring from each vertex, and all are alike.
+    inner_label = kind << KIND_SHIFT
+    if weighted:
+        inner_label |= (8 >> (wp.abs(dx) + wp.abs(dy) + wp.abs(dz))) << CELLS_SHIFT
+        if kind == STRUCTURAL:
+            inner_label |= 8
+    at = starts[d]
+    span = wp.vec4i(0, 0, 0, 0)
+    for x in range(grid.row_low.shape[0]):
+        for y in range(grid.row_low.shape[1]):
+            for z in range(grid.row_low[x, y], grid.row_high[x, y]):
+                here = grid.row_start[x, y] + z - grid.row_low[x, y]
+                there = vertex(grid, x + reach * dx, y + reach * dy, z + reach * dz)
+                inner = is_inner(grid, here) and is_inner(grid, there)
+                if inner and kind == BEND:
+                    inner = is_inner(grid, vertex(grid, x + dx, y + dy, z + dz))
+                if inner and weighted and kind == STRUCTURAL:
+                    inner = is_inner(grid, vertex(grid, x - dx, y - dy, z - dz)) and (
+                        is_inner(grid, vertex(grid, x + 2 * dx, y + 2 * dy, z + 2 * dz))
+                    )
+                if inner:
+                    span, at = append_spring(spans, span, at, grid.first[here], grid.first[there], inner_label)
+                elif kind == BEND:
+                    bends = bends_from(grid, x, y, z, dx, dy, dz)
+                    for b in range(bends.count):
+                        label = kind << KIND_SHIFT
+                        if weighted:
+                            label |= bends.cells[b] << CELLS_SHIFT
+                        span, at = append_spring(spans, span, at, bends.start[b], bends.end[b], label)
+                else:
+                    found = springs_from(grid, x, y, z, dx, dy, dz)
+                    for s in range(4):
+                        if found.start[s] >= 0:
+                            label = kind << KIND_SHIFT
+                            if weighted:
+                                label |= found.cells[s] << CELLS_SHIFT
+                                if kind == STRUCTURAL:
+                                    label |= bend_cells(grid, x, y, z, dx, dy, dz, s)
+                            span, at = append_spring(spans, span, at, found.start[s], found.end[s], label)
+    counts[d] = store_span(spans, span, at) - starts[d]
+
+
+@wp.kernel
+def find_faces(
+    # In:
+    grid: Grid,
+    starts: wp.array(dtype=wp.int32),
+    # Out:
+    quads: wp.array(dtype=wp.vec4i),
+    counts: wp.array(dtype=wp.int32),
+):
+    """Overwrite the exposed faces of cells on one of six sides, from its start on, and how many there are.
+
+    The corners, particles, go round counter-clockwise from outside. Without room for faces, count them alone.
+    """
+    direction = wp.tid()
+    axis = direction / 2
+    side = direction % 2
+    # The other two axes, in the order that makes their cross product point along +axis.
+    u = (axis + 1) % 3
+    w = (axis + 2) % 3
+    at = starts[direction]
+    step = wp.vec3i(0, 0, 0)
+    step[axis] = 2 * side - 1
+    for x in range(grid.row_low.shape[0] - 1):
+        for y in range(grid.row_low.shape[1] - 1):
+            for z in range(grid.row_low[x, y], grid.row_high[x, y]):
+                # A cell is cell 7 of its lowest vertex.
+                if int(grid.patterns[vertex(grid, x, y, z)]) >= 128:
+                    if occupied(grid, x + step[0], y + step[1], z + step[2]) == 0:
+                        if at < quads.shape[0]:
+                            quad = wp.vec4i(0, 0, 0, 0)
+                            for k in range(4):
+                                # (0, 0), (1, 0), (1, 1), (0, 1) along (u, w), or the other way round.
+                                corner = wp.vec3i(0, 0, 0)
+                                corner[axis] = side
+                                along_u = (k + 1) / 2 % 2
+                                along_w = k / 2
+                                corner[u] = wp.where(side == 1, along_u, along_w)
+                                corner[w] = wp.where(side == 1, along_w, along_u)
+                                place = vertex(grid, x + corner[0], y + corner[1], z + corner[2])
+                                number = 7 - (4 * corner[0] + 2 * corner[1] + corner[2])
+                                quad[k] = corner_particle(grid, place, number)
+                            quads[at] = quad
+                        at += 1
+    counts[direction] = at - starts[direction]
