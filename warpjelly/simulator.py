@@ -442,7 +442,10 @@ class Simulator:
         if len(model.colliders.kind) == 0:
             return
         chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES
-        self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], [self._lower, self._upper])
+        if self.scene.solver.culling:
+            self._launch(
+                bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], [self._lower, self._upper]
+            )
         self._launch(
             contacts.add_contact_forces,
             (chunk_count, lanes),
