@@ -7,6 +7,8 @@ from typing import Any
 
 import warp as wp
 
+from . import vectors
+
 wp.set_module_options({"enable_backward": False})
 
 # Boxes are grown by this share of 1 m plus their distance from the origin. It is far above the rounding errors of both
@@ -66,16 +68,43 @@ def update_chunk_bounds(
     _store_box(x, chunk_start[chunk], chunk_start[chunk + 1], infinity, lower, upper, chunk)
 
 
+@wp.kernel
+def update_body_bounds(
+    # Model:
+    body_chunk_start: wp.array(dtype=wp.int32),
+    # State in:
+    lower: wp.array2d(dtype=Any),
+    upper: wp.array2d(dtype=Any),
+    # Out:
+    body_lower: wp.array2d(dtype=Any),
+    body_upper: wp.array2d(dtype=Any),
+):
+    """Overwrite the box [3, body_count] of each body by those of its chunks, one thread per body."""
+    body = wp.tid()
+    begin = body_chunk_start[body]
+    low = vectors.load(lower, begin)
+    high = vectors.load(upper, begin)
+    for chunk in range(begin + 1, body_chunk_start[body + 1]):
+        low = wp.min(low, vectors.load(lower, chunk))
+        high = wp.max(high, vectors.load(upper, chunk))
+    vectors.store(body_lower, body, low)
+    vectors.store(body_upper, body, high)
+
+
 @wp.func
-def boxes_overlap(lower_a: Any, upper_a: Any, lower_b: Any, upper_b: Any):
-    """Say whether two boxes share a point."""
+def are_near(lower_a: Any, upper_a: Any, lower_b: Any, upper_b: Any, reach: Any):
+    """Say whether two boxes are within reach of each other along every axis.
+
+    Rounding keeps order, so no difference of a coordinate between particles of the two is smaller than that of the
+    boxes: if this says no, no two particles are within reach, bit for bit.
+    """
     return (
-        lower_a[0] <= upper_b[0]
-        and lower_b[0] <= upper_a[0]
-        and lower_a[1] <= upper_b[1]
-        and lower_b[1] <= upper_a[1]
-        and lower_a[2] <= upper_b[2]
-        and lower_b[2] <= upper_a[2]
+        lower_a[0] - upper_b[0] <= reach
+        and lower_b[0] - upper_a[0] <= reach
+        and lower_a[1] - upper_b[1] <= reach
+        and lower_b[1] - upper_a[1] <= reach
+        and lower_a[2] - upper_b[2] <= reach
+        and lower_b[2] - upper_a[2] <= reach
     )
 
 

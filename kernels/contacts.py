@@ -199,7 +199,7 @@ def contact_energy(depth: Any, counted: Any, stiffness: Any):
 def may_touch(colliders: Any, c: int, body: int, lower: Any, upper: Any):
     """Say whether a box of particles may hold one in contact with collider c; never wrongly no."""
     if colliders.kind[c] == SPHERE:
-        return bounds.boxes_overlap(lower, upper, colliders.lower[c], colliders.upper[c])
+        return bounds.are_near(lower, upper, colliders.lower[c], colliders.upper[c], type(lower[0])(0.0))
     center = colliders.center[c]
     clear = bounds.is_beyond(lower, upper, center, colliders.side[c, body] * colliders.normal[c])
     if not clear and colliders.kind[c] == PLANE:
