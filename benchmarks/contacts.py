@@ -1,21 +1,25 @@
-"""What contact and culling cost: a cube far from six colliders and on the ground, with culling and without.
+"""What contact and culling cost: a cube and six colliders, and two cubes and each other, with culling and without.
 
 python benchmarks/contacts.py
 
-Shares are of a substep without any collider, medians over rounds in which the variants take turns, so that a machine
-whose speed drifts still gives ratios that hold. The cube of 10 particles per edge with six objects is the case that the
-thesis "Gelatin Cubes" (USI 2023) measures.
+Shares are of a substep without any contact, medians over rounds in which the variants take turns, so that a machine
+whose speed drifts still gives ratios that hold. Variants share their arrays: where arrays lie in memory changes the
+speed of a cube of 32 particles per edge, whose rows are powers of two, by more than what is measured. The cube of 10
+particles per edge with six objects is the case that the thesis "Gelatin Cubes" (USI 2023) measures.
 """
 
+import copy
+import dataclasses
 import statistics
 import time
+from typing import Any
 
 from warpjelly.scene import Scene
 from warpjelly.simulator import Simulator
 
-ROUNDS = 15
+ROUNDS = 75
 # How long each variant steps in a round, s.
-SLICE = 0.1
+SLICE = 0.02
 SIX_OBJECTS = [
     {"type": "plane", "normal": [0.0, 1.0, 0.0], "size": [10.0, 10.0]},
     {"type": "plane", "center": [4.0, 2.0, 0.0], "normal": [-1.0, 0.0, 0.0], "size": [4.0, 4.0]},
@@ -26,24 +30,35 @@ SIX_OBJECTS = [
 ]
 
 
-def make_simulator(particles_per_edge: int, *, height: float, colliders: bool, culling: bool = True) -> Simulator:
-    """Return a cube of 1 m at some height [m], whose steps are so short that it stays there."""
+def make_simulator(particles_per_edge: int, *places: list[float], **parts: Any) -> Simulator:
+    """Return cubes of 1 m at some places [m]; they are pinned, so that they stay there."""
+    cube = {
+        "type": "cube",
+        "material": "jelly",
+        "particles_per_edge": particles_per_edge,
+        "pinned": [{"lower": [-1.0] * 3, "upper": [1.0] * 3}],
+    }
     scene = {
         "name": "contacts",
         "fps": 1000.0,
-        "solver": {"dt": 1e-5, "culling": culling},
+        "solver": {"dt": 1e-5},
         "materials": {"jelly": {}},
-        "bodies": [
-            {
-                "type": "cube",
-                "material": "jelly",
-                "particles_per_edge": particles_per_edge,
-                "position": [0.0, height, 0.0],
-            }
-        ],
-        "colliders": SIX_OBJECTS if colliders else [],
+        "bodies": [{**cube, "name": f"cube_{i}", "position": place} for i, place in enumerate(places)],
+        **parts,
     }
     return Simulator(Scene.model_validate(scene), device="cpu")
+
+
+def variants_of(culled: Simulator) -> list[Simulator]:
+    """Return a simulator without contact, as it is, and without culling."""
+    free, full = copy.copy(culled), copy.copy(culled)
+    nothing = make_simulator(2, [0.0, 0.0, 0.0]).model.colliders
+    free.model = dataclasses.replace(culled.model, colliders=nothing, skin=None)
+    solver = culled.scene.solver.model_copy(update={"culling": False})
+    full.scene = culled.scene.model_copy(update={"solver": solver})
+    for variant in (free, full):
+        variant._graphs = {}
+    return [free, culled, full]
 
 
 def seconds_per_substep(simulator: Simulator, count: int) -> float:
@@ -53,28 +68,39 @@ def seconds_per_substep(simulator: Simulator, count: int) -> float:
     return (time.perf_counter() - began) / count
 
 
+def measure(culled: Simulator) -> tuple[float, float, float]:
+    """Return what contact costs with culling and without, as shares, and a substep without contact, s."""
+    variants = variants_of(culled)
+    for simulator in variants:
+        simulator.prepare()
+        simulator.step()
+    count = max(1, round(SLICE / seconds_per_substep(variants[0], 3)))
+    rounds = [[seconds_per_substep(simulator, count) for simulator in variants] for _ in range(ROUNDS)]
+    culling, full = (statistics.median(times[i] / times[0] for times in rounds) - 1.0 for i in (1, 2))
+    return culling, full, statistics.median(times[0] for times in rounds)
+
+
 def main() -> None:
     """Print a row for each size."""
-    print("particles  million springs/s       far    far, no culling    on the ground    on the ground, no culling")
+    print("                             far from six objects         on the ground")
+    print("particles  M springs/s    culling   no culling    culling   no culling")
     for size in (8, 10, 32, 64):
-        variants = [
-            make_simulator(size, height=5.0, colliders=False),
-            make_simulator(size, height=5.0, colliders=True),
-            make_simulator(size, height=5.0, colliders=True, culling=False),
-            make_simulator(size, height=0.4999, colliders=True),
-            make_simulator(size, height=0.4999, colliders=True, culling=False),
-        ]
-        for simulator in variants:
-            simulator.step()
-        count = max(1, round(SLICE / seconds_per_substep(variants[0], 3)))
-        rounds = [[seconds_per_substep(simulator, count) for simulator in variants] for _ in range(ROUNDS)]
-        free = statistics.median(times[0] for times in rounds)
-        shares = [statistics.median(times[i] / times[0] for times in rounds) - 1 for i in range(1, len(variants))]
-        speed = variants[0].model.spring_count / free / 1e6
-        columns = [f"{share:+.1%}" for share in shares]
-        print(
-            f"{size}^3".rjust(9), f"{speed:18.0f}", *(c.rjust(w) for c, w in zip(columns, (9, 18, 16, 28), strict=True))
-        )
+        shares = []
+        for height in (5.0, 0.4999):
+            simulator = make_simulator(size, [0.0, height, 0.0], colliders=SIX_OBJECTS)
+            culling, full, seconds = measure(simulator)
+            shares += [f"{culling:+11.1%}", f"{full:+13.1%}"]
+        print(f"{size}^3".rjust(9), f"{simulator.model.spring_count / seconds / 1e6:12.0f}", *shares, sep="")
+    print("\n                       apart               touching            mode all")
+    print("particles    culling   no culling    culling   no culling         apart")
+    for size in (8, 16, 32):
+        shares = []
+        # Opposite particles touch at a distance of a unit cell.
+        for gap in (1.0, 0.9 / (size - 1)):
+            culling, full, _ = measure(make_simulator(size, [0.0, 0.0, 0.0], [1.0 + gap, 0.01, 0.02], soft_contact={}))
+            shares += [f"{culling:+11.1%}", f"{full:+13.1%}"]
+        both = make_simulator(size, [0.0, 0.0, 0.0], [2.0, 0.0, 0.0], soft_contact={"mode": "all"})
+        print(f"2 x {size}^3".rjust(9), *shares, f"{measure(both)[0]:+14.1%}", sep="")
 
 
 if __name__ == "__main__":

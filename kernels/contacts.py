@@ -198,23 +198,21 @@ def contact_energy(depth: Any, counted: Any, stiffness: Any):
 @wp.func
 def may_touch(colliders: Any, c: int, body: int, lower: Any, upper: Any):
     """Say whether a box of particles may hold one in contact with collider c; never wrongly no."""
-    zero = type(lower[0])(0.0)
     if colliders.kind[c] == SPHERE:
-        return bounds.boxes_overlap(lower, upper, colliders.lower[c], colliders.upper[c])
+        return bounds.are_near(lower, upper, colliders.lower[c], colliders.upper[c], type(lower[0])(0.0))
     center = colliders.center[c]
-    normal = colliders.side[c, body] * colliders.normal[c]
-    touches = bounds.least_height(lower, upper, center, normal) <= zero
-    if touches and colliders.kind[c] == PLANE:
+    clear = bounds.is_beyond(lower, upper, center, colliders.side[c, body] * colliders.normal[c])
+    if not clear and colliders.kind[c] == PLANE:
         # A contact that holds may be anywhere behind the rectangle, so there is no bound on that side.
         a = colliders.size[c][0] * colliders.tangent[c]
         b = colliders.size[c][1] * colliders.bitangent[c]
-        touches = (
-            bounds.least_height(lower, upper, center + a, colliders.tangent[c]) <= zero
-            and bounds.least_height(lower, upper, center - a, -colliders.tangent[c]) <= zero
-            and bounds.least_height(lower, upper, center + b, colliders.bitangent[c]) <= zero
-            and bounds.least_height(lower, upper, center - b, -colliders.bitangent[c]) <= zero
+        clear = (
+            bounds.is_beyond(lower, upper, center + a, colliders.tangent[c])
+            or bounds.is_beyond(lower, upper, center - a, -colliders.tangent[c])
+            or bounds.is_beyond(lower, upper, center + b, colliders.bitangent[c])
+            or bounds.is_beyond(lower, upper, center - b, -colliders.bitangent[c])
         )
-    return touches
+    return not clear
 
 
 @wp.func

@@ -2,14 +2,15 @@
 
 A particle is a ball of half a unit cell's edge. Two of one body never touch where they were close at rest: nearer than
 their radii, or joined by a spring. Each particle sums the forces of its neighbours itself; what two do to each other is
-the same up to the sign, bit for bit, so that momentum is kept to rounding and no atomic adds are needed.
+the same up to the sign, bit for bit, so that momentum is kept to rounding and no atomic adds are needed. Far from every
+other body, by the boxes of chunks, nobody searches for neighbours.
 """
 
 from typing import Any
 
 import warp as wp
 
-from . import vectors
+from . import bounds, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,28 +18,93 @@ wp.set_module_options({"enable_backward": False})
 SEARCH_MARGIN = 1e-5
 # Nearer than the sum of radii at rest is nearer by more than this share, far above the rounding of places at rest.
 REST_MARGIN = 1e-3
-# Farther from the origin than this [m], no cell of the grid has a number.
-LOST = 1e7
+
+
+def _skin_struct(real: type) -> Any:
+    @wp.struct
+    class Skin:
+        particles: wp.array(dtype=wp.int32)  # [skin_count]
+        body: wp.array(dtype=wp.int32)  # [skin_count]
+        chunk: wp.array(dtype=wp.int32)  # [skin_count]
+        radius: wp.array(dtype=real)  # [skin_count] m
+        rest: wp.array(dtype=wp.types.vector(3, real))  # [skin_count] place at rest in the frame of the body, m
+        neighbor_start: wp.array(dtype=wp.int32)  # [skin_count + 1] first neighbour of each, and the end of the last
+        neighbors: wp.array(dtype=wp.int32)  # [neighbor_count] members of the skin that springs join to each
+        greatest_radius: real  # m
+        stiffness: real  # N/m of overlap
+        damping: real  # N s/m along the line of centres
+        friction: real  # share of the normal force
+        with_itself: wp.bool  # whether particles of one body collide
+
+    return Skin
+
+
+# The particles that collide with others, by precision; the same members, so that kernels take either.
+SKIN = {wp.float32: _skin_struct(wp.float32), wp.float64: _skin_struct(wp.float64)}
+
+
+@wp.kernel
+def find_meetings(
+    # Model:
+    chunk_body: wp.array(dtype=wp.int32),
+    body_chunk_start: wp.array(dtype=wp.int32),
+    skin: Any,
+    # State in:
+    lower: wp.array2d(dtype=Any),
+    upper: wp.array2d(dtype=Any),
+    body_lower: wp.array2d(dtype=Any),
+    body_upper: wp.array2d(dtype=Any),
+    # Out:
+    near_lower: wp.array2d(dtype=Any),
+    near_upper: wp.array2d(dtype=Any),
+    found: wp.array(dtype=wp.int32),
+):
+    """Overwrite the box [3, chunk_count] around what each chunk may touch, one thread per chunk.
+
+    That is the box around those chunks of other bodies which are within reach; without any, nothing is within reach of
+    it. With any, found[0] becomes 1.
+    """
+    chunk = wp.tid()
+    body = chunk_body[chunk]
+    low = vectors.load(lower, chunk)
+    high = vectors.load(upper, chunk)
+    infinity = type(low[0])(wp.inf)
+    near_low = wp.vector(infinity, infinity, infinity)
+    near_high = -near_low
+    reach = search_radius(skin, skin.greatest_radius)
+    for other in range(body_lower.shape[1]):
+        if other != body and bounds.are_near(
+            low, high, vectors.load(body_lower, other), vectors.load(body_upper, other), reach
+        ):
+            for c in range(body_chunk_start[other], body_chunk_start[other + 1]):
+                other_low = vectors.load(lower, c)
+                other_high = vectors.load(upper, c)
+                if bounds.are_near(low, high, other_low, other_high, reach):
+                    near_low = wp.min(near_low, other_low)
+                    near_high = wp.max(near_high, other_high)
+                    found[0] = 1
+    vectors.store(near_lower, chunk, near_low)
+    vectors.store(near_upper, chunk, near_high)
 
 
 @wp.kernel
 def gather_skin(
     # Model:
-    skin: wp.array(dtype=wp.int32),
+    skin: Any,
     # State in:
     x: wp.array2d(dtype=Any),
     # Out:
     points: wp.array(dtype=Any),
 ):
-    """Overwrite the positions of the skin's particles, for the grid to be built over.
+    """Overwrite the positions of the skin's particles, for the grid to be built over."""
+    a = wp.tid()
+    points[a] = vectors.load(x, skin.particles[a])
 
-    The grid cannot take numbers that are not finite: whoever is lost is put at the origin, to be found after the frame.
-    """
-    point = wp.tid()
-    position = vectors.load(x, skin[point])
-    if not (wp.length(position) < type(position[0])(LOST)):
-        position = type(position[0])(0.0) * points[point]
-    points[point] = position
+
+@wp.func
+def search_radius(skin: Any, radius: Any):
+    """Return how far from a particle of some radius the centres of those are that it may touch, m."""
+    return (radius + skin.greatest_radius) * type(radius)(1.0 + SEARCH_MARGIN)
 
 
 @wp.func
@@ -73,133 +139,113 @@ def pair_force(offset: Any, velocity: Any, reach: Any, stiffness: Any, damping: 
 
 
 @wp.func
-def are_joined(neighbor_start: wp.array(dtype=wp.int32), neighbors: wp.array(dtype=wp.int32), a: int, b: int):
+def are_joined(skin: Any, a: int, b: int):
     """Say whether a spring joins two points of the skin."""
     joined = bool(False)
-    for k in range(neighbor_start[a], neighbor_start[a + 1]):
-        if neighbors[k] == b:
+    for k in range(skin.neighbor_start[a], skin.neighbor_start[a + 1]):
+        if skin.neighbors[k] == b:
             joined = True
     return joined
 
 
 @wp.func
-def may_collide(
-    skin_body: wp.array(dtype=wp.int32),
-    skin_rest: wp.array(dtype=Any),
-    neighbor_start: wp.array(dtype=wp.int32),
-    neighbors: wp.array(dtype=wp.int32),
-    with_itself: bool,
-    reach: Any,
-    a: int,
-    b: int,
-):
+def may_collide(skin: Any, reach: Any, a: int, b: int):
     """Say whether two points of the skin collide when they meet."""
     collide = bool(True)
-    if skin_body[a] == skin_body[b]:
-        collide = with_itself
+    if skin.body[a] == skin.body[b]:
+        collide = skin.with_itself
         if collide:
             # Opposite walls of a gap of one cell are exactly that far apart at rest: rounding must not decide.
             apart = reach * type(reach)(1.0 - REST_MARGIN)
-            collide = wp.length(skin_rest[a] - skin_rest[b]) >= apart and not are_joined(
-                neighbor_start, neighbors, a, b
-            )
+            collide = wp.length(skin.rest[a] - skin.rest[b]) >= apart and not are_joined(skin, a, b)
     return collide
 
 
 @wp.kernel
 def add_pair_forces(
     # Model:
-    skin: wp.array(dtype=wp.int32),
-    skin_body: wp.array(dtype=wp.int32),
-    skin_radius: wp.array(dtype=Any),
-    skin_rest: wp.array(dtype=Any),
-    neighbor_start: wp.array(dtype=wp.int32),
-    neighbors: wp.array(dtype=wp.int32),
-    response: wp.array(dtype=Any),
+    skin: Any,
     mass: wp.array(dtype=Any),
     # State in:
+    near_lower: wp.array2d(dtype=Any),
+    near_upper: wp.array2d(dtype=Any),
     grid: wp.uint64,
     points: wp.array(dtype=Any),
     v: wp.array2d(dtype=Any),
     # In:
-    with_itself: bool,
-    greatest_radius: Any,
     dt: Any,
     loss_weight: Any,
+    culling: bool,
     # State out:
     f: wp.array2d(dtype=Any),
     losses: wp.array2d(dtype=wp.float64),
 ):
     """Add the forces on each particle of the skin, one thread each.
 
-    ``response`` [1] is stiffness [N/m], damping [N s/m] and friction. Losses [2, point_count] gain each particle's half
-    of the power of damping and of friction times loss_weight.
+    With culling, only particles near what their chunk may touch look for others. Losses [2, skin_count] gain each
+    particle's half of the power of damping and of friction times loss_weight.
     """
     a = wp.tid()
-    i = skin[a]
     point = points[a]
+    chunk = skin.chunk[a]
+    search = search_radius(skin, skin.radius[a])
+    near_low = vectors.load(near_lower, chunk)
+    near_high = vectors.load(near_upper, chunk)
+    if culling and not bounds.are_near(point, point, near_low, near_high, search):
+        return
+    i = skin.particles[a]
     total = type(dt)(0.0) * point
     damped = wp.float64(0.0)
     rubbed = wp.float64(0.0)
-    half = wp.float64(0.5) * wp.float64(loss_weight)
-    c = response[0]
-    search = (skin_radius[a] + greatest_radius) * type(dt)(1.0 + SEARCH_MARGIN)
+    touches = bool(False)
     query = wp.hash_grid_query(grid, point, search)
     b = wp.int32(0)
     while wp.hash_grid_query_next(query, b):
         if b != a:
             offset = point - points[b]
-            reach = skin_radius[a] + skin_radius[b]
-            if wp.length(offset) < reach and may_collide(
-                skin_body, skin_rest, neighbor_start, neighbors, with_itself, reach, a, b
-            ):
-                j = skin[b]
+            reach = skin.radius[a] + skin.radius[b]
+            if wp.length(offset) < reach and may_collide(skin, reach, a, b):
+                touches = True
+                j = skin.particles[b]
                 velocity = vectors.load(v, i) - vectors.load(v, j)
                 reduced = mass[i] * mass[j] / (mass[i] + mass[j])
-                force, overlap = pair_force(offset, velocity, reach, c[0], c[1], c[2], reduced, dt)
+                force, overlap = pair_force(
+                    offset, velocity, reach, skin.stiffness, skin.damping, skin.friction, reduced, dt
+                )
                 total += force
                 normal = wp.normalize(offset)
                 push = wp.dot(force, normal)
                 speed = wp.dot(velocity, normal)
-                damped -= wp.float64((push - c[0] * overlap) * speed)
+                damped -= wp.float64((push - skin.stiffness * overlap) * speed)
                 rubbed -= wp.float64(wp.dot(force - push * normal, velocity))
-    vectors.store(f, i, vectors.load(f, i) + total)
-    losses[0, a] += half * damped
-    losses[1, a] += half * rubbed
+    # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
+    if touches:
+        half = wp.float64(0.5) * wp.float64(loss_weight)
+        vectors.store(f, i, vectors.load(f, i) + total)
+        losses[0, a] += half * damped
+        losses[1, a] += half * rubbed
 
 
 @wp.kernel
 def measure_pairs(
     # Model:
-    skin_body: wp.array(dtype=wp.int32),
-    skin_radius: wp.array(dtype=Any),
-    skin_rest: wp.array(dtype=Any),
-    neighbor_start: wp.array(dtype=wp.int32),
-    neighbors: wp.array(dtype=wp.int32),
-    response: wp.array(dtype=Any),
+    skin: Any,
     # State in:
     grid: wp.uint64,
     points: wp.array(dtype=Any),
-    # In:
-    with_itself: bool,
-    greatest_radius: Any,
     # Out:
     energy: wp.array(dtype=wp.float64),
 ):
-    """Overwrite each point's half of the energy stored in its overlaps, 1/2 k overlap^2, [point_count], J."""
+    """Overwrite each point's half of the energy stored in its overlaps, 1/2 k overlap^2, [skin_count], J."""
     a = wp.tid()
     point = points[a]
     stored = wp.float64(0.0)
-    query = wp.hash_grid_query(
-        grid, point, (skin_radius[a] + greatest_radius) * type(greatest_radius)(1.0 + SEARCH_MARGIN)
-    )
+    query = wp.hash_grid_query(grid, point, search_radius(skin, skin.radius[a]))
     b = wp.int32(0)
     while wp.hash_grid_query_next(query, b):
         if b != a:
-            reach = skin_radius[a] + skin_radius[b]
+            reach = skin.radius[a] + skin.radius[b]
             overlap = reach - wp.length(point - points[b])
-            if overlap > type(reach)(0.0) and may_collide(
-                skin_body, skin_rest, neighbor_start, neighbors, with_itself, reach, a, b
-            ):
-                stored += wp.float64(0.25) * wp.float64(response[0][0] * overlap * overlap)
+            if overlap > type(reach)(0.0) and may_collide(skin, reach, a, b):
+                stored += wp.float64(0.25) * wp.float64(skin.stiffness * overlap * overlap)
     energy[a] = stored

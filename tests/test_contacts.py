@@ -8,10 +8,13 @@ from typing import Any
 import numpy as np
 import pytest
 import reference
+import warp as wp
 from probes import probe, push, push_fully
 from reference import EPSILON, ROUND_OFF, World
 from worlds import make_material, make_scene, make_voxels, set_state
 
+from warpjelly.kernels import bounds
+from warpjelly.model import PRECISIONS
 from warpjelly.scene import Scene
 from warpjelly.simulator import Simulator
 
@@ -344,6 +347,37 @@ def test_culling_does_not_change_a_bit(kind: str, precision: str) -> None:
         contacts_seen += full.diagnostics()["contacts"]
     assert contacts_seen > 0
     assert np.isfinite(full.positions).all()
+
+
+def test_boxes_are_the_extremes_of_their_particles(precision: str, device: str) -> None:
+    """Find the least and greatest coordinates of chunks of many sizes; what is not a number does not count."""
+    sizes = np.array([1, 2, 31, 32, 33, 63, 64, 100, 255, 256, 3])
+    start = np.append(0, np.cumsum(sizes))
+    x = np.random.default_rng(4).normal(size=(3, start[-1])).astype(precision)
+    x[0, start[3] + 7] = np.nan
+    x[1, start[4]] = -np.inf
+    x[:, start[-2] :] = np.nan
+    real = PRECISIONS[precision]
+    lower, upper = (wp.full((3, len(sizes)), np.nan, dtype=real, device=device) for _ in range(2))
+    inputs = [wp.array(start, dtype=wp.int32, device=device), wp.array(x, dtype=real, device=device)]
+    wp.launch(bounds.update_chunk_bounds, dim=len(sizes), inputs=inputs, outputs=[lower, upper], device=device)
+    np.testing.assert_array_equal(lower.numpy(), np.fmin.reduceat(np.fmin(x, np.inf), start[:-1], axis=1))
+    np.testing.assert_array_equal(upper.numpy(), np.fmax.reduceat(np.fmax(x, -np.inf), start[:-1], axis=1))
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf, 1e30])
+@pytest.mark.parametrize("kind", COLLIDERS)
+def test_a_lost_particle_hides_no_contact(kind: str, lost: float, precision: str, device: str) -> None:
+    """Lose a particle of a box whose others are in contact: they feel the same bits with culling and without."""
+    simulator = make_simulator(COLLIDERS[kind], precision, device)
+    points = draw_points(400, precision, 1)
+    x = points[touch_any(simulator.scene.colliders[0], points, START)][:10]
+    for particle, axis in itertools.product((0, 5, 9), range(3)):
+        lossy = x.copy()
+        lossy[particle, axis] = lost
+        culled, full = (push(simulator, lossy, 0 * x, culling=culling, size=10) for culling in (True, False))
+        assert culled.tobytes() == full.tobytes()
+        assert full.any(axis=1).sum() >= 9
 
 
 @pytest.mark.parametrize("far", [0.0, 1000.0])

@@ -37,7 +37,7 @@ def put(simulator: Simulator, x: np.ndarray, v: np.ndarray | None = None) -> Non
 def stored_energy(simulator: Simulator) -> float:
     """Return the energy of all overlaps, J."""
     assert simulator.model.skin is not None
-    return simulator._pair_energy(simulator.model.skin)
+    return simulator._pair_energy()
 
 
 def loose_points(*groups: list[list[float]], masses: tuple[float, ...] = (), **changes: Any) -> Scene:
@@ -344,16 +344,80 @@ def launches_of(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def test_off_and_single_bodies_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Count what a substep launches: pairs are extra only where something may collide."""
+    """Count what a substep launches: pairs are extra only where something may collide, a search where it is near."""
     plain = ["set_gravity_forces", "add_span_forces", "semi_implicit_euler", "count_step"]
-    colliding = [*plain[:2], "gather_skin", "build", "add_pair_forces", *plain[2:]]
+    boxes = ["update_chunk_bounds", "update_body_bounds", "find_meetings"]
+    search = ["gather_skin", "build", "add_pair_forces"]
     one = two_cubes().bodies[:1]
-    for bodies, mode, expected in [
-        (None, "off", plain), (one, "off", plain), (one, "bodies", plain),
-        (None, "bodies", colliding), (None, "all", colliding), (one, "all", colliding),
+    for changes, mode, culling, extra in [
+        ({}, "off", True, []), ({"bodies": one}, "off", True, []), ({"bodies": one}, "bodies", True, []),
+        ({}, "bodies", True, [*boxes, *search]), ({}, "bodies", False, search), ({}, "all", True, search),
+        ({"gap": 1.5}, "bodies", True, boxes), ({"gap": 1.5}, "bodies", False, search),
+        ({"bodies": one}, "all", True, search),
     ]:  # fmt: skip
-        scene = two_cubes(soft_contact={"mode": mode}, **({"bodies": bodies} if bodies else {}))
-        assert launches_of(scene, monkeypatch) == expected, mode
+        scene = two_cubes(soft_contact={"mode": mode}, solver={"dt": 5e-4, "culling": culling}, **changes)
+        assert launches_of(scene, monkeypatch) == [*plain[:2], *extra, *plain[2:]], (mode, culling)
+
+
+def three_bodies(culling: bool, **solver: Any) -> Scene:
+    """Return two turning cubes of several chunks that fly at each other from afar, and a small one between them."""
+    shapes = ((8, 1.0, -1.3, 4.0), (3, 0.3, 0.05, 0.0), (7, 1.2, 1.4, -4.0))
+    bodies = [
+        {"name": f"cube_{n}", "type": "cube", "material": "jelly", "particles_per_edge": n, "size": size,
+         "position": [x, 0.1 * size, 0.02], "velocity": [speed, 0.0, 0.0], "angular_velocity": [1.0, 2.0, 3.0]}
+        for n, size, x, speed in shapes
+    ]  # fmt: skip
+    materials = {"jelly": make_material(60.0, 0.05)}
+    return colliding(bodies=bodies, materials=materials, solver={"dt": 2.5e-4, "culling": culling, **solver})
+
+
+@pytest.mark.parametrize("integrator", ["semi_implicit_euler", "rk4"])
+def test_culling_does_not_change_a_bit(device: str, precision: str, integrator: str) -> None:
+    """Collide three bodies with boxes and without: the same bits, before they meet, then, and after."""
+    culled, full = (
+        Simulator(three_bodies(culling, precision=precision, integrator=integrator), device=device)
+        for culling in (True, False)
+    )
+    meetings = []
+    for _ in range(45):
+        for simulator in (culled, full):
+            simulator.step(50)
+        meetings.append(bool(culled._meetings.numpy()[0]))
+        for name in ("x", "v", "f", "pair_losses"):
+            assert getattr(culled.state, name).numpy().tobytes() == getattr(full.state, name).numpy().tobytes(), name
+    assert not meetings[0] and any(meetings) and not meetings[-1]
+    assert full.diagnostics()["friction_losses"] > 0.0
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf, 1e30])
+def test_a_lost_particle_touches_nobody_and_hides_nobody(device: str, precision: str, lost: float) -> None:
+    """Lose one of many points in each other: it gets no force, others the same bits with culling and without."""
+    x = np.random.default_rng(2).uniform(-3.0, 3.0, (600, 3))
+    forces = []
+    for culling in (True, False):
+        solver = {"precision": precision, "culling": culling}
+        simulator = Simulator(loose_points(x[:300].tolist(), x[300:].tolist(), solver=solver), device=device)
+        lossy = x.copy()
+        lossy[0, 1] = lost
+        put(simulator, lossy)
+        forces.append(simulator.forces)
+    assert forces[0].tobytes() == forces[1].tobytes()
+    np.testing.assert_array_equal(forces[0][0], 0.0)
+    assert np.count_nonzero(forces[0].any(axis=1)) > 300
+
+
+def test_only_chunks_near_another_body_are_searched(device: str, precision: str) -> None:
+    """Put two cubes of two chunks each face to face: those at the faces find each other, those behind find nothing."""
+    scene = two_cubes(8, gap=0.1, solver={"dt": 5e-4, "precision": precision})
+    simulator = Simulator(scene, device=device)
+    x, body = simulator.positions, simulator.model.chunk_body.numpy()
+    assert body.tolist() == [0, 0, 1, 1]
+    lower, upper = simulator._near_lower.numpy().T, simulator._near_upper.numpy().T
+    # Chunks are layers along x: the second of the left cube and the first of the right one.
+    for chunk, other in ((1, x[512:768]), (2, x[256:512])):
+        np.testing.assert_array_equal([lower[chunk], upper[chunk]], [other.min(axis=0), other.max(axis=0)])
+    for chunk in (0, 3):
+        assert (lower[chunk] > upper[chunk]).all()
 
 
 @pytest.mark.parametrize("mode", ["bodies", "all"])

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, fields, springs
+from warpjelly.kernels import bounds, contacts, fields, pairs, springs
 from warpjelly.kernels.lattices import BEND, BODY_SHEAR, FACE_SHEAR, STRUCTURAL
 
 from .errors import InputError
@@ -62,28 +62,6 @@ class Body:
 
 
 @dataclass(frozen=True)
-class Skin:
-    """Particles that collide with other particles, those on the surface of each body; see kernels/pairs.py."""
-
-    particles: wp.array
-    """int32 [skin_count]."""
-    body: wp.array
-    """int32 [skin_count]."""
-    radius: wp.array
-    """real [skin_count], m."""
-    rest: wp.array
-    """Place at rest in the frame of the body, real vec3 [skin_count], m."""
-    neighbor_start: wp.array
-    """First neighbour of each, and the end of the last, int32 [skin_count + 1]."""
-    neighbors: wp.array
-    """Members of the skin that springs join to each, int32 [neighbor_count]."""
-    greatest_radius: float
-    """m."""
-    response: wp.array
-    """(stiffness [N/m], damping [N s/m], friction), real vec3 [1]."""
-
-
-@dataclass(frozen=True)
 class Model:
     """What stays the same over a run. Arrays are on the device; real is float32 or float64."""
 
@@ -106,6 +84,8 @@ class Model:
     """First particle of each chunk, and the end of the last, int32 [chunk_count + 1]."""
     chunk_body: wp.array
     """int32 [chunk_count]."""
+    body_chunk_start: wp.array
+    """First chunk of each body, and the end of the last, int32 [body_count + 1]."""
     gravity: wp.array
     """real vec3 [1], m/s^2."""
     colliders: Any
@@ -116,8 +96,8 @@ class Model:
     """Particle of each point that is shown, int32 [point_count], body after body."""
     surface_quads: wp.array
     """Indices into surface_particles, vec4i [face_count]."""
-    skin: Skin | None
-    """The particles that collide with others, where any do."""
+    skin: Any | None
+    """The table of kernels/pairs.py of the particles that collide with others, where any do."""
 
 
 @dataclass(frozen=True)
@@ -215,6 +195,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         spring_classes=array(np.concatenate(classes), vector),
         chunk_start=array(np.append(np.concatenate(chunks), np.int32(particle_count)), wp.int32),
         chunk_body=array(np.concatenate(chunk_bodies), wp.int32),
+        body_chunk_start=array(np.cumsum([0, *map(len, chunks)]), wp.int32),
         gravity=array(scene.gravity_vector[None], vector),
         colliders=_colliders(scene, [_center_of_mass(x[b.particles], mass[b.particles]) for b in bodies], real, device),
         fields=_fields(scene, real, device),
@@ -234,7 +215,9 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         stamps=wp.full((slots, particle_count), -2, dtype=wp.int32, device=device),
         normals=wp.zeros((3 * remembered, particle_count), dtype=real, device=device),
         spring_losses=wp.zeros(len(model.spans), dtype=wp.float64, device=device),
-        pair_losses=wp.zeros((2, len(model.skin.particles) if model.skin else 0), dtype=wp.float64, device=device),
+        pair_losses=wp.zeros(
+            (2, 0 if model.skin is None else len(model.skin.particles)), dtype=wp.float64, device=device
+        ),
         field_work=wp.zeros(particle_count if scene.fields else 0, dtype=wp.float64, device=device),
         contact_losses=wp.zeros((2, len(model.chunk_body)), dtype=wp.float64, device=device),
     )
@@ -394,10 +377,11 @@ def _fields(scene: Scene, real: type, device: str) -> Any:
     return table
 
 
-def _skin(scene: Scene, lattices: Sequence[Lattice], real: type, device: str) -> Skin:
-    """Return the particles that collide with each other."""
-    particles, bodies, radii, rest, starts, neighbors = [], [], [], [], [], []
-    first = count = neighbor_count = 0
+def _skin(scene: Scene, lattices: Sequence[Lattice], real: type, device: str) -> Any:
+    """Return the table of the particles that collide with each other."""
+    contact = scene.soft_contact
+    particles, bodies, chunks, radii, rest, starts, neighbors = ([] for _ in range(7))
+    first = count = chunk_count = neighbor_count = 0
     for number, lattice in enumerate(lattices):
         on_skin = np.zeros(len(lattice.particles), bool)
         on_skin[lattice.surface_particles] = True
@@ -413,28 +397,29 @@ def _skin(scene: Scene, lattices: Sequence[Lattice], real: type, device: str) ->
         neighbors.append(ends[:, 1])
         particles.append(members + first)
         bodies.append(np.full(len(members), number))
-        own = scene.soft_contact.radius
-        radii.append(np.full(len(members), lattice.unit / 2 if own is None else own))
+        chunks.append(chunk_count + members // CHUNK_SIZE)
+        radii.append(np.full(len(members), lattice.unit / 2 if contact.radius is None else contact.radius))
         rest.append(lattice.particles[members])
         first += len(lattice.particles)
         count += len(members)
+        chunk_count += -(-len(lattice.particles) // CHUNK_SIZE)
         neighbor_count += len(ends)
 
     def array(parts: list[np.ndarray], dtype: Any) -> wp.array:
         return wp.array(np.concatenate(parts), dtype=dtype, device=device)
 
-    contact = scene.soft_contact
-    vector = wp.types.vector(3, real)
-    return Skin(
-        particles=array(particles, wp.int32),
-        body=array(bodies, wp.int32),
-        radius=array(radii, real),
-        rest=array(rest, vector),
-        neighbor_start=array([*starts, np.array([neighbor_count])], wp.int32),
-        neighbors=array(neighbors, wp.int32),
-        greatest_radius=float(max(part.max() for part in radii)),
-        response=array([np.array([[contact.stiffness, contact.damping, contact.friction]])], vector),
-    )
+    table = pairs.SKIN[real]()
+    table.particles = array(particles, wp.int32)
+    table.body = array(bodies, wp.int32)
+    table.chunk = array(chunks, wp.int32)
+    table.radius = array(radii, real)
+    table.rest = array(rest, wp.types.vector(3, real))
+    table.neighbor_start = array([*starts, np.array([neighbor_count])], wp.int32)
+    table.neighbors = array(neighbors, wp.int32)
+    table.greatest_radius = max(part.max() for part in radii)
+    table.stiffness, table.damping, table.friction = contact.stiffness, contact.damping, contact.friction
+    table.with_itself = contact.mode == "all"
+    return table
 
 
 def _colliders(scene: Scene, centers_of_mass: Sequence[np.ndarray], real: type, device: str) -> Any:

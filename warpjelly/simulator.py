@@ -13,7 +13,7 @@ from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators
 
 from .device import choose_device
 from .errors import DivergedError, InputError
-from .model import Model, Skin, State, build, launch_spring_forces
+from .model import Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
 from .stability import SAFETY, add_contacts, measure_pairs, step_limits
@@ -74,14 +74,19 @@ class Simulator:
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
             if (skin := self.model.skin) is not None:
-                self._with_itself = self.scene.soft_contact.mode == "all"
+                real, body_count = self.model.real, len(self.model.bodies)
+                self._body_lower, self._body_upper = (wp.zeros((3, body_count), dtype=real) for _ in range(2))
+                self._near_lower, self._near_upper = (wp.zeros((3, chunk_count), dtype=real) for _ in range(2))
+                self._meetings = wp.zeros(1, dtype=wp.int32)
                 self._grid = wp.HashGrid(GRID_SIZE, GRID_SIZE, GRID_SIZE, dtype=self.model.real)
                 self._grid.reserve(len(skin.particles))
-                self._skin_points = wp.zeros(len(skin.particles), dtype=skin.rest.dtype)
+                self._skin_points = wp.zeros_like(skin.rest)
                 self._pair_energies = wp.zeros(len(skin.particles), dtype=wp.float64)
         self._graphs: dict[int, Any] = {}
         self._capturable = True
         # Kernels compile at their first launch, which must not be inside a capture; a step of no time changes nothing.
+        if self.model.skin is not None:
+            self._search_pairs(loss_weight=0.0)
         self._add_forces(loss_weight=0.0)
         if scratch:
             self._integrate_stage(0.0, 0.0, 0.0, first=True, last=True)
@@ -237,7 +242,7 @@ class Simulator:
             "kinetic": float(total[diagnostics.KINETIC]),
             "elastic": float(self._elastic.numpy()[0]),
             "potential": float(total[diagnostics.POTENTIAL]),
-            "contact": float(total[diagnostics.CONTACT]) + (self._pair_energy(model.skin) if model.skin else 0.0),
+            "contact": float(total[diagnostics.CONTACT]) + self._pair_energy(),
             "spring_losses": float(self.state.spring_losses.numpy().sum()),
             "field_work": float(self.state.field_work.numpy().sum()),
             "contact_losses": float(contact_losses[0]),
@@ -275,6 +280,12 @@ class Simulator:
             )
             for body in model.bodies
         ]
+
+    @property
+    def _culls_pairs(self) -> bool:
+        """Whether only those particles search for others that are near another body."""
+        skin = self.model.skin
+        return skin is not None and not skin.with_itself and self.scene.solver.culling
 
     @staticmethod
     def _copy(rows: wp.array) -> np.ndarray:
@@ -363,48 +374,58 @@ class Simulator:
             [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
         )
 
-    def _build_grid(self, skin: Skin) -> None:
+    def _build_grid(self) -> None:
         """Sort the particles of the skin into the grid, at their current positions."""
-        self._launch(pairs.gather_skin, len(skin.particles), [skin.particles, self.state.x], [self._skin_points])
+        skin: Any = self.model.skin
+        self._launch(pairs.gather_skin, len(skin.particles), [skin, self.state.x], [self._skin_points])
         # Cells of two balls' width: fewer of them to search than of one, and hardly more balls.
         self._grid.build(self._skin_points, 4.0 * skin.greatest_radius)
 
-    def _add_pair_forces(self, skin: Skin, loss_weight: float) -> None:
-        model, state, real = self.model, self.state, self.model.real
-        self._build_grid(skin)
+    def _search_pairs(self, *, loss_weight: float) -> None:
+        """Add the forces between particles."""
+        model = self.model
+        self._build_grid()
         self._launch(
             pairs.add_pair_forces,
-            len(skin.particles),
+            len(self._skin_points),
             [
-                *(skin.particles, skin.body, skin.radius, skin.rest, skin.neighbor_start, skin.neighbors),
-                *(
-                    skin.response,
-                    model.particle_mass,
-                    wp.uint64(self._grid.id),
-                    self._skin_points,
-                    state.v,
-                    self._with_itself,
-                ),
-                *(real(skin.greatest_radius), real(self.dt), real(loss_weight)),
+                *(model.skin, model.particle_mass, self._near_lower, self._near_upper),
+                *(wp.uint64(self._grid.id), self._skin_points, self.state.v),
+                *(model.real(self.dt), model.real(loss_weight), self._culls_pairs),
             ],
-            [state.f, state.pair_losses],
+            [self.state.f, self.state.pair_losses],
         )
 
-    def _pair_energy(self, skin: Skin) -> float:
+    def _add_pair_forces(self, *, loss_weight: float) -> None:
+        """Add the forces between particles; without a search where no body is near another one."""
+        if not self._culls_pairs:
+            self._search_pairs(loss_weight=loss_weight)
+            return
+        model = self.model
+        boxes, body_boxes = [self._lower, self._upper], [self._body_lower, self._body_upper]
+        self._launch(bounds.update_body_bounds, len(model.bodies), [model.body_chunk_start, *boxes], body_boxes)
+        self._meetings.zero_()
+        self._launch(
+            pairs.find_meetings,
+            len(model.chunk_body),
+            [model.chunk_body, model.body_chunk_start, model.skin, *boxes, *body_boxes],
+            [self._near_lower, self._near_upper, self._meetings],
+        )
+        if self.device == "cpu":
+            wp.capture_if(self._meetings, self._search_pairs, loss_weight=loss_weight)
+        else:
+            # Conditional parts of CUDA graphs may not copy from memory of the host, as the build of a grid does.
+            self._search_pairs(loss_weight=loss_weight)
+
+    def _pair_energy(self) -> float:
         """Return the energy stored in overlaps of particles, J."""
-        self._build_grid(skin)
+        if self.model.skin is None:
+            return 0.0
+        self._build_grid()
         self._launch(
             pairs.measure_pairs,
-            len(skin.particles),
-            [
-                *(skin.body, skin.radius, skin.rest, skin.neighbor_start, skin.neighbors, skin.response),
-                *(
-                    wp.uint64(self._grid.id),
-                    self._skin_points,
-                    self._with_itself,
-                    self.model.real(skin.greatest_radius),
-                ),
-            ],
+            len(self._skin_points),
+            [self.model.skin, wp.uint64(self._grid.id), self._skin_points],
             [self._pair_energies],
         )
         return float(self._pair_energies.numpy().sum())
@@ -437,12 +458,15 @@ class Simulator:
             loss_weight=loss_weight,
             losses=state.spring_losses,
         )
-        if model.skin is not None:
-            self._add_pair_forces(model.skin, loss_weight)
-        if len(model.colliders.kind) == 0:
-            return
         chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES
-        self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], [self._lower, self._upper])
+        has_colliders = len(model.colliders.kind) > 0
+        if self._culls_pairs or (has_colliders and self.scene.solver.culling):
+            boxes = [self._lower, self._upper]
+            self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], boxes)
+        if model.skin is not None:
+            self._add_pair_forces(loss_weight=loss_weight)
+        if not has_colliders:
+            return
         self._launch(
             contacts.add_contact_forces,
             (chunk_count, lanes),

@@ -151,8 +151,8 @@ def add_contacts(pairs: np.ndarray, model: Model) -> np.ndarray:
     """
     added = np.stack([model.colliders.stiffness.numpy(), model.colliders.damping.numpy()], axis=1).astype(float)
     if model.skin is not None:
-        between = model.skin.response.numpy()[0, :2].astype(float)
-        added = np.concatenate([added.reshape(-1, 2), SOFT_PARTNERS * between[None]])
+        between = np.array([[model.skin.stiffness, model.skin.damping]])
+        added = np.concatenate([added.reshape(-1, 2), SOFT_PARTNERS * between])
     if len(added) == 0:
         return pairs
     added *= float(model.particle_inv_mass.numpy().max())
