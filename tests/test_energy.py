@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from test_contacts import COLLIDERS, PENALTY, START
 from test_scenes import NAMES, SCENES
-from worlds import make_material, make_scene, set_state
+from worlds import frames_of, make_material, make_scene, set_state
 
 from warpjelly.scenefile import load_scene
 from warpjelly.simulator import Simulator
@@ -222,16 +222,8 @@ def test_thrown_cubes_gain_no_energy(integrator: str, kind: str, damping: float)
     assert found[-1] < 0.9 * found[0]
 
 
-# Particle steps of a scene that are simulated here, about 3 s: all of them but the coupler, which is down by then.
-MOST_WORK = 2e7
 # The scenes that are to stay in one piece with their own step.
 LASTING = [name for name in NAMES if load_scene(SCENES / f"{name}.toml").expect.diverges is None]
-
-
-def frames_of(simulator: Simulator) -> int:
-    """Return how many frames of a scene are simulated here."""
-    work = len(simulator.masses) * simulator.substeps
-    return min(simulator.scene.frame_count - 1, math.ceil(MOST_WORK / work))
 
 
 def losses(measured: dict[str, Any]) -> float:
