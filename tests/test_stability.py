@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -159,42 +160,71 @@ def test_the_limit_is_neither_unsafe_nor_timid(name: str, integrator: str) -> No
     assert matrices.growth(integrator, 1.3, limit) > 1e6
 
 
-@pytest.mark.parametrize("damping", [0.0, 0.2])
-@pytest.mark.parametrize("body", ["cube", "unequal cube", "tree"])
-def test_the_simulator_obeys_the_limit(body: str, damping: float) -> None:
-    """Keep a small perturbation small for 5000 steps at 0.95 of the limit, and blow it up at 1.3 of it."""
-    material = make_material(100.0, damping)
-    if body == "unequal cube":
-        material = {kind: {name: value * factor for name, value in material[kind].items()}
-                    for kind, factor in (("structural", 1.0), ("shear", 3.0), ("bend", 0.2))}  # fmt: skip
-        # Another damping / stiffness for the shear springs.
-        material["shear"]["damping"] *= 0.3
+def make_cloth(material: dict[str, Any], **changes: Any) -> Scene:
+    """Return a scene of a cloth of 12 by 12 particles."""
+    body = {"name": "cloth", "type": "cloth", "size": [1.0, 1.0], "particles": [12, 12], "material": "jelly"}
+    return make_scene(bodies=[body], materials={"jelly": material}, **changes)
 
-    def build(dt: float) -> Simulator:
-        # A frame is one step, of exactly this length.
-        changes: dict[str, Any] = {"solver": {"dt": dt}, "fps": 1 / dt}
-        count = 8 if body == "cube" else 5
-        return Simulator(make_tree(material, **changes) if body == "tree" else make_cube(count, material, **changes))
 
-    limit = build(1e-3).step_limits(contacts=False)["semi_implicit_euler"]
-    assert limit is not None
-    rng, scale = np.random.default_rng(5), 1e-6
-    for share, bounded in ((0.95, True), (1.3, False)):
-        simulator = build(share * limit)
-        assert simulator.dt == pytest.approx(share * limit, rel=1e-12)
-        rest = simulator.positions
-        start = rest + scale * simulator.model.bodies[0].unit * rng.standard_normal(rest.shape)
-        set_state(simulator, x=start)
-        first = simulator.diagnostics()["elastic"]
-        simulator.step(5000)
-        if bounded:
-            # The scheme conserves H + dt/2 v.F of linear springs, which differs from H by up to w dt/2 = 0.95 of it:
-            # H stays within (1 + 0.95) / (1 - 0.95) = 39 times the first. Damping takes away.
-            now = simulator.diagnostics()
-            assert now["elastic"] + now["kinetic"] <= 39 * first
-        else:
-            largest = np.abs(simulator.positions - rest).max()
-            assert not largest < 1e3 * scale
+BODIES: dict[str, Callable[..., Scene]] = {
+    "cube": lambda material, **changes: make_cube(8, material, **changes),
+    "tree": make_tree,
+    "cloth": make_cloth,
+}
+# The last two have another damping / stiffness for each kind of spring, the first of them so much that some motions
+# creep, the other one so little that all swing.
+PERTURBED = {
+    "damped": make_material(100.0, 0.2),
+    "undamped": make_material(100.0, 0.0),
+    "mixed": MIXED,
+    "unequal": {
+        "structural": {"stiffness": 30.0, "damping": 0.1},
+        "shear": {"stiffness": 90.0, "damping": 0.1},
+        "bend": {"stiffness": 6.0, "damping": 0.02},
+    },
+}
+
+
+def growths(body: str, material: str, integrator: str, dt: float) -> list[float]:
+    """Return by how much the energy of a small perturbation about rest has grown, at some times over 2000 steps."""
+    # A frame is 20 steps of exactly this length.
+    changes: dict[str, Any] = {"solver": {"integrator": integrator, "dt": dt, "steps_per_frame": 20}, "fps": 0.05 / dt}
+    simulator = Simulator(BODIES[body](PERTURBED[material], **changes), device="cpu")
+    assert simulator.dt == dt
+    rest, rng = simulator.positions, np.random.default_rng(5)
+    set_state(simulator, x=rest + 1e-6 * simulator.model.bodies[0].unit * rng.standard_normal(rest.shape))
+    first, found = simulator.diagnostics()["elastic"], []
+    for _ in range(100):
+        simulator.step(20)
+        now = simulator.diagnostics()
+        found.append((now["elastic"] + now["kinetic"]) / first)
+        # Once a thousand times as far away, energy is not a quadratic form for much longer.
+        if not found[-1] < 1e6:
+            break
+    return found
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+@pytest.mark.parametrize("material", PERTURBED)
+@pytest.mark.parametrize("body", BODIES)
+def test_the_simulator_obeys_the_limit(body: str, material: str, integrator: str) -> None:
+    """Keep a small perturbation small at 0.95 of the limit, and make it a thousand times as large at 1.3 of it."""
+    limits = limits_of(BODIES[body](PERTURBED[material]))
+    limit = limits[integrator]
+    if limit is None:
+        assert material == "undamped"
+        assert integrator in ("explicit_euler", "rk2")
+        # With z = dt w up to 0.7 energy grows by z^2 or z^4/4 = 0.06 in a step.
+        shortest = limits["rk4"]
+        assert shortest is not None
+        assert not growths(body, material, integrator, 0.25 * shortest)[-1] < 1e6
+        return
+    # By 4 / (1 - share) at most with semi-implicit Euler: see the scenes below. The others have the modes of the exact
+    # flow, whose energy never grows: they only mix position and velocity, by (1 + z) / (1 - z) for a damping ratio z,
+    # which is 19 for 0.9. This start, without velocity, mixes little even where motions creep.
+    assert max(growths(body, material, integrator, 0.95 * limit)) <= 80
+    # The square of a thousand.
+    assert not growths(body, material, integrator, 1.3 * limit)[-1] < 1e6
 
 
 def test_the_limit_falls_with_the_roots_of_stiffness_and_mass(precision: str) -> None:
