@@ -26,12 +26,12 @@ WALL_NORMAL = np.array([1.0, 2.0, -2.0]) / 3.0
 CORNER = np.array(DEFAULTS["box"]["center"]) - np.array(DEFAULTS["box"]["size"]) / 2.0
 
 
-def limit_of_contact(integrator: str, mass: float, damping: float) -> float | None:
+def limit_of_contact(integrator: str, mass: float, damping: float, stiffness: float = STIFFNESS) -> float | None:
     """Return the largest stable step of one particle in contact, s."""
-    return step_limits(np.array([[0.0, 0.0], [STIFFNESS / mass, damping / mass]]))[integrator]
+    return step_limits(np.array([[0.0, 0.0], [stiffness / mass, damping / mass]]))[integrator]
 
 
-def bounce_bound(integrator: str, dt: float, mass: float, damping: float) -> float:
+def bounce_bound(integrator: str, dt: float, mass: float, damping: float, stiffness: float = STIFFNESS) -> float:
     """Return how many times the energy along the normal can be after a bounce what it was before it, at most.
 
     With depth x, speed of approach u, a = k/m, d = c/m: u' = -a x - d u while that pushes, else 0; u is constant
@@ -46,7 +46,7 @@ def bounce_bound(integrator: str, dt: float, mass: float, damping: float) -> flo
     It is at most (1 + d dt + a dt^2) u^2 when contact begins; and where the spring-damper would pull, u < 0, it is at
     least u^2 (1 - d^2/(4 a)). Steps of which some stages are out of contact get less of the force.
     """
-    a, d = STIFFNESS / mass, damping / mass
+    a, d = stiffness / mass, damping / mass
     if integrator == "semi_implicit_euler":
         return (1.0 - d * dt / 2.0) / (1.0 - d * dt / 2.0 - a * dt * dt / 4.0)
     return (1.0 + d * dt + a * dt * dt) / (1.0 - d * d / (4.0 * a))
@@ -154,6 +154,63 @@ def test_bounces_lose_energy_at_the_step_of_auto(integrator: str, kind: str) -> 
         bounce = Bounce(kind, integrator, SAFETY[integrator] * limit, mass=mass, contact={})
         assert bounce.turned.all()
         assert bounce.after.sum() < bounce.before.sum(), mass
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_no_two_particles_part_faster_than_the_scheme_can(integrator: str) -> None:
+    """Let pairs of particles of two bodies bounce off each other, at all phases, with defaults and undamped.
+
+    They move like one of the reduced mass, m/2, against a ball of the sum of their radii.
+    """
+    side, radius, mass = 6, 0.05, 0.01
+    places = np.stack(np.meshgrid(*[np.arange(side) - side / 2.0] * 3), axis=-1).reshape(-1, 3)
+    bodies = [
+        {"name": name, "type": "network", "material": "jelly", "points": (places + 0.5 * shift).tolist()}
+        for name, shift in (("here", 0.0), ("there", 1.0))
+    ]
+    for options, share in itertools.product(({}, {"damping": 0.0, "friction": 0.0}), SHARES):
+        defaults = make_scene(soft_contact={"mode": "bodies", **options}).soft_contact
+        stiffness, damping = defaults.stiffness, defaults.damping
+        limit = limit_of_contact(integrator, mass / 2.0, damping, stiffness)
+        if limit is None:
+            assert damping == 0.0
+            assert integrator in ("explicit_euler", "rk2")
+            continue
+        dt = share * limit
+        scene = make_scene(
+            bodies=bodies, materials={"jelly": make_material(0.0, 0.0, particle_mass=mass)},
+            soft_contact={"mode": "bodies", "radius": radius, **options},
+            solver={"integrator": integrator, "dt": dt, "steps_per_frame": 1}, fps=1.0 / dt,
+        )  # fmt: skip
+        simulator = Simulator(scene, device="cpu")
+        rng, count = np.random.default_rng(23), len(places)
+        frequency = math.sqrt(stiffness / (mass / 2.0))
+        speed = 0.002 * 2.0 * radius * frequency * 10.0 ** rng.uniform(-2.0, 0.0, count)
+        normal = rng.normal(size=(count, 3))
+        normal /= np.linalg.norm(normal, axis=1)[:, None]
+        across = np.cross(normal, rng.normal(size=(count, 3)))
+        across /= np.linalg.norm(across, axis=1)[:, None]
+        angle = rng.uniform(0.0, 1.3, (count, 1))
+        relative = speed[:, None] * (np.sin(angle) * across - np.cos(angle) * normal)
+        phase = rng.uniform(0.0, 1.0, (count, 1))
+        apart = 2.0 * radius * normal - relative * dt * (2.0 + phase)
+        set_state(
+            simulator,
+            x=np.concatenate([places - apart / 2.0, places + apart / 2.0]),
+            v=np.concatenate([-relative / 2.0, relative / 2.0]),
+        )
+        steps = math.ceil(1.2 * math.pi / (frequency * dt)) + 8
+        simulator.step(steps)
+        parting = simulator.velocities[count:] - simulator.velocities[:count]
+        after = (parting**2).sum(axis=1)
+        into = (speed * np.cos(angle[:, 0])) ** 2
+        assert ((parting * relative).sum(axis=1) < speed**2 - 0.5 * into).all()
+        # The normal turns along the way, as with a ball.
+        turn = 4.0 * speed * steps * dt / (2.0 * radius)
+        bound = bounce_bound(integrator, dt, mass / 2.0, damping, stiffness)
+        assert (after <= speed**2 + (bound - 1.0 + turn) * into).all(), (damping, share)
+        if options == {} and share <= 0.5:
+            assert (after <= speed**2).all(), share
 
 
 def mechanical(measured: dict[str, Any]) -> float:
