@@ -18,6 +18,8 @@ from warpjelly.stability import INTEGRATORS, SAFETY, step_limits
 
 # What a scene gets that says nothing about contact: 2000 N/m, 1 N s/m, friction.
 DEFAULTS = {kind: {key: value for key, value in c.items() if key not in PENALTY} for kind, c in COLLIDERS.items()}
+DEFAULTS["entry"] = DEFAULTS["sphere"] | {"normal": "entry"}
+BALLS = ("sphere", "entry")
 STIFFNESS, DAMPING = 2000.0, 1.0
 RADIUS = COLLIDERS["sphere"]["radius"]
 SMOOTH = {"damping": 0.0, "static_friction": 0.0, "dynamic_friction": 0.0}
@@ -73,7 +75,7 @@ class Bounce:
         # Nobody gets to another wall of the room, or beside the plane, be they four times as fast afterwards; and a
         # ball is nearly flat for who sinks in by v / w.
         fastest = min(3.0, 0.1 / (steps * dt))
-        if kind == "sphere":
+        if kind in BALLS:
             fastest = min(fastest, 0.002 * RADIUS * frequency)
         speed = fastest * 10.0 ** rng.uniform(-2.0, 0.0, count)
         phase = rng.uniform(0.0, 1.0, (count, 3 if kind == "box" else 1))
@@ -83,7 +85,7 @@ class Bounce:
             border, inward = CORNER, speed
         else:
             normal = np.tile(WALL_NORMAL, (count, 1))
-            if kind == "sphere":
+            if kind in BALLS:
                 normal = rng.normal(size=(count, 3))
                 normal /= np.linalg.norm(normal, axis=1)[:, None]
             across = np.cross(normal, rng.normal(size=(count, 3)))
@@ -91,7 +93,7 @@ class Bounce:
             angle = rng.uniform(0.0, 1.3, count)
             inward = speed * np.cos(angle)
             v = (speed * np.sin(angle))[:, None] * across - inward[:, None] * normal
-            border = np.array(DEFAULTS[kind]["center"]) + (RADIUS * normal if kind == "sphere" else 0.0)
+            border = np.array(DEFAULTS[kind]["center"]) + (RADIUS * normal if kind in BALLS else 0.0)
         # They arrive in the third step.
         set_state(simulator, x=border - v * dt * (2.0 + phase), v=v)
         simulator.step(steps)
@@ -99,7 +101,7 @@ class Bounce:
         """Twice the kinetic energy of each particle by its mass, before and after, m^2/s^2."""
         self.into = inward**2
         """That of the motion along the normal, before."""
-        self.turn = 4.0 * speed * steps * dt / RADIUS if kind == "sphere" else 0.0 * speed
+        self.turn = 4.0 * speed * steps * dt / RADIUS if kind in BALLS else 0.0 * speed
         """By how much the normal of a ball turns along the way, coming and going, twice."""
         self.contacts = simulator.diagnostics()["contacts"]
         """Particles that are still in contact."""
@@ -235,7 +237,8 @@ def throw_cubes(kind: str, **options: Any) -> dict[str, Any]:
         away += max(0.0, 0.7 * float(np.linalg.norm(away)) - away @ WALL_NORMAL) * WALL_NORMAL
         away /= np.linalg.norm(away)
         # Half a diagonal and more from the surface; a room's is around the middle.
-        distance = {"sphere": RADIUS + 0.4, "box": 0.3}.get(kind, 0.4 / (away @ WALL_NORMAL))
+        wall = 0.4 / (away @ WALL_NORMAL)
+        distance = {"half_space": wall, "plane": wall, "box": 0.3}.get(kind, RADIUS + 0.4)
         speed = rng.uniform(1.0, 6.0) * (1.0 if kind == "box" else -1.0)
         bodies.append(
             {"name": f"cube_{number}", "type": "cube", "material": "jelly", "particles_per_edge": 3, "size": 0.3,
