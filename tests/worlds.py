@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
 
 from warpjelly.scene import Scene
 from warpjelly.simulator import Simulator
+
+# Particle steps that a test of every scene spends on one, about 3 s: all there are but of the coupler, which is down by
+# then.
+MOST_WORK = 2e7
 
 
 def make_material(stiffness: float = 400.0, damping: float = 0.6, **changes: Any) -> dict[str, Any]:
@@ -53,3 +58,9 @@ def substeps_of(scene: Scene) -> int:
 def step_of(scene: Scene) -> float:
     """Return the time step of a scene, s."""
     return scene.dt_for(substeps_of(scene))
+
+
+def frames_of(simulator: Simulator) -> int:
+    """Return how many frames a test of every scene simulates."""
+    work = len(simulator.masses) * simulator.substeps
+    return min(simulator.scene.frame_count - 1, math.ceil(MOST_WORK / work))
