@@ -35,6 +35,7 @@ from warpjelly.kernels.lattices import (
 from warpjelly.kernels.springs import MAX_SPAN
 
 from .device import start_warp
+from .errors import InputError
 
 # Rest lengths of the four kinds of springs, in unit cells.
 REST_LENGTHS = np.sqrt([1.0, 2.0, 3.0, 4.0])
@@ -46,6 +47,8 @@ DIRECTIONS = sorted(
 )
 DIRECTIONS += DIRECTIONS[:3]
 KINDS = np.repeat([STRUCTURAL, FACE_SHEAR, BODY_SHEAR, BEND], [3, 6, 4, 3])
+# Vertices are numbered in int32.
+MAX_VERTICES = 2**31 - 1
 # Corners of a cell as (x, y, z) bits; a corner's number is 4 x + 2 y + z. Cells around a vertex are numbered alike.
 CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
@@ -115,6 +118,9 @@ def build_lattice(
         cell_size: edge of a jelly cube, m.
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
         weighted: tell springs apart by how many cells contain them, too; otherwise there are four classes, the kinds.
+
+    Raises:
+        InputError: the grid has more vertices than can be numbered.
     """
     unit = cell_size / (particles_per_edge - 1)
     grid, particle_count = _number_particles(cells, particles_per_edge - 1)
@@ -233,6 +239,8 @@ def _number_particles(cells: np.ndarray, refinement: int) -> tuple[Grid, int]:
     high = refinement * _reduce_around(np.maximum, highest, refinement, 0) + 1
     lengths = np.where(high > low, high - low, 0)
     vertex_count = int(lengths.sum())
+    if vertex_count > MAX_VERTICES:
+        raise InputError(f"a grid of {vertex_count:,} vertices is more than the {MAX_VERTICES:,} that can be numbered")
 
     def array(data: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(data, dtype=dtype, device="cpu")
