@@ -235,11 +235,13 @@ def measure_pairs(
     points: wp.array(dtype=Any),
     # Out:
     energy: wp.array(dtype=wp.float64),
+    overlaps: wp.array(dtype=wp.float64),
 ):
-    """Overwrite each point's half of the energy stored in its overlaps, 1/2 k overlap^2, [skin_count], J."""
+    """Overwrite each point's half of the energy stored in its overlaps, 1/2 k overlap^2, J, and the greatest, m."""
     a = wp.tid()
     point = points[a]
     stored = wp.float64(0.0)
+    greatest = wp.float64(0.0)
     query = wp.hash_grid_query(grid, point, search_radius(skin, skin.radius[a]))
     b = wp.int32(0)
     while wp.hash_grid_query_next(query, b):
@@ -248,4 +250,6 @@ def measure_pairs(
             overlap = reach - wp.length(point - points[b])
             if overlap > type(reach)(0.0) and may_collide(skin, reach, a, b):
                 stored += wp.float64(0.25) * wp.float64(skin.stiffness * overlap * overlap)
+                greatest = wp.max(greatest, wp.float64(overlap))
     energy[a] = stored
+    overlaps[a] = greatest

@@ -358,6 +358,20 @@ def test_a_body_that_starts_in_a_collider_is_warned_of(warpjelly, tmp_path):
     assert "warning: body 'cube' starts 0.2 m deep in a collider" in err
 
 
+def test_bodies_that_start_in_each_other_are_warned_of(warpjelly, tmp_path):
+    """Warn of bodies nearer than a unit cell, with the overlap of their balls, and not of those a cell apart."""
+    cube = ["[[bodies]]", 'type = "cube"', 'material = "jelly"', "particles_per_edge = 3"]
+    scene = tmp_path / "scene.toml"
+    found = {}
+    for away in (1.3, 1.5):
+        scene.write_text("\n".join(["[materials.jelly]", *cube, *cube, f"position = [{away}, 0.0, 0.0]"]))
+        code, _, err = warpjelly("check", scene)
+        assert code == 0
+        # Unit cells of 0.5 m.
+        found[away] = "'cube_0', 'cube_1' start too close together: the balls" in err and "by up to 0.2 m" in err
+    assert found == {1.3: True, 1.5: False}
+
+
 def test_a_plane_through_a_body_is_warned_of(warpjelly, tmp_path):
     """Warn of a plane that cuts a body, with the depth, unless the body is beside, in front or wholly behind."""
     lines = ["[materials.jelly]", "[[bodies]]", 'type = "cube"', 'material = "jelly"', "particles_per_edge = 3"]

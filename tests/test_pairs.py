@@ -13,7 +13,8 @@ from worlds import make_material, make_scene, make_voxels
 
 from warpjelly.errors import DivergedError
 from warpjelly.scene import Scene
-from warpjelly.simulator import GRID_SIZE, Simulator
+from warpjelly.simulator import Simulator
+from warpjelly.softcontact import GRID_SIZE
 
 LOOSE = make_material(0.0, 0.0)
 """Springs without force: what acts is what particles do to each other."""
@@ -37,7 +38,7 @@ def put(simulator: Simulator, x: np.ndarray, v: np.ndarray | None = None) -> Non
 def stored_energy(simulator: Simulator) -> float:
     """Return the energy of all overlaps, J."""
     assert simulator.model.skin is not None
-    return simulator._pair_energy()
+    return simulator._soft.measure()[0]
 
 
 def loose_points(*groups: list[list[float]], masses: tuple[float, ...] = (), **changes: Any) -> Scene:
@@ -382,7 +383,7 @@ def test_culling_does_not_change_a_bit(device: str, precision: str, integrator: 
     for _ in range(45):
         for simulator in (culled, full):
             simulator.step(50)
-        meetings.append(bool(culled._meetings.numpy()[0]))
+        meetings.append(bool(culled._soft._meetings.numpy()[0]))
         for name in ("x", "v", "f", "pair_losses"):
             assert getattr(culled.state, name).numpy().tobytes() == getattr(full.state, name).numpy().tobytes(), name
     assert not meetings[0] and any(meetings) and not meetings[-1]
@@ -412,7 +413,7 @@ def test_only_chunks_near_another_body_are_searched(device: str, precision: str)
     simulator = Simulator(scene, device=device)
     x, body = simulator.positions, simulator.model.chunk_body.numpy()
     assert body.tolist() == [0, 0, 1, 1]
-    lower, upper = simulator._near_lower.numpy().T, simulator._near_upper.numpy().T
+    lower, upper = simulator._soft._near_lower.numpy().T, simulator._soft._near_upper.numpy().T
     # Chunks are layers along x: the second of the left cube and the first of the right one.
     for chunk, other in ((1, x[512:768]), (2, x[256:512])):
         np.testing.assert_array_equal([lower[chunk], upper[chunk]], [other.min(axis=0), other.max(axis=0)])

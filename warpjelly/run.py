@@ -238,8 +238,8 @@ def _metrics_row(index: int, seconds: float, figures: Mapping[str, Any]) -> dict
     for name, value in figures.items():
         if name in ("momentum", "angular_momentum"):
             row |= {f"{name}_{axis}": float(component) for axis, component in zip("xyz", value, strict=True)}
-        elif name == "penetrations":
-            row["max_penetration"] = float(value.max())
+        elif name in ("penetrations", "overlaps"):
+            row[f"max_{name[:-1]}"] = float(value.max())
         else:
             row[name] = value
     return row

@@ -9,13 +9,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, pairs, surfaces
+from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, surfaces
 
 from .device import choose_device
 from .errors import DivergedError, InputError
 from .model import Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
+from .softcontact import SoftContact
 from .stability import SAFETY, add_contacts, measure_pairs, step_limits
 from .surface import SurfaceFrame
 
@@ -23,8 +24,6 @@ log = logging.getLogger("warpjelly")
 
 # A captured graph holds at most this many substeps; longer frames replay it. Capturing costs as much as ten replays.
 MAX_CAPTURED_SUBSTEPS = 64
-# Cells along each axis of the grid in which colliding particles are sorted; it repeats beyond.
-GRID_SIZE = 32
 # Warp cannot capture in two threads at once.
 _capture_lock = threading.Lock()
 
@@ -73,20 +72,11 @@ class Simulator:
             self._normals = wp.zeros(point_count, dtype=wp.vec3f)
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
-            if (skin := self.model.skin) is not None:
-                real, body_count = self.model.real, len(self.model.bodies)
-                self._body_lower, self._body_upper = (wp.zeros((3, body_count), dtype=real) for _ in range(2))
-                self._near_lower, self._near_upper = (wp.zeros((3, chunk_count), dtype=real) for _ in range(2))
-                self._meetings = wp.zeros(1, dtype=wp.int32)
-                self._grid = wp.HashGrid(GRID_SIZE, GRID_SIZE, GRID_SIZE, dtype=self.model.real)
-                self._grid.reserve(len(skin.particles))
-                self._skin_points = wp.zeros_like(skin.rest)
-                self._pair_energies = wp.zeros(len(skin.particles), dtype=wp.float64)
+        culling = self.scene.solver.culling
+        self._soft = SoftContact(self.model, self.state, culling=culling) if self.model.skin is not None else None
         self._graphs: dict[int, Any] = {}
         self._capturable = True
         # Kernels compile at their first launch, which must not be inside a capture; a step of no time changes nothing.
-        if self.model.skin is not None:
-            self._search_pairs(loss_weight=0.0)
         self._add_forces(loss_weight=0.0)
         if scratch:
             self._integrate_stage(0.0, 0.0, 0.0, first=True, last=True)
@@ -223,7 +213,8 @@ class Simulator:
             ``friction_losses`` took since the start, J; together they keep their sum, to the order of the scheme;
             ``momentum`` [3], kg m/s; ``angular_momentum`` [3] about the origin, kg m^2/s;
             ``max_speed``, m/s; ``penetrations`` [body_count], the greatest depth of a particle of each body in a
-            collider, m; ``contacts``, the number of particles in each collider summed.
+            collider, m; ``overlaps`` [body_count], that of its particles with others as balls, m; ``contacts``, the
+            number of particles in each collider summed.
         """
         model, state = self.model, self.state
         self._elastic.zero_()
@@ -236,13 +227,14 @@ class Simulator:
         sums = self._measure_chunks()
         total, greatest = sums.sum(axis=0), sums.max(axis=0)
         contact_losses = state.contact_losses.numpy().sum(axis=1) + state.pair_losses.numpy().sum(axis=1)
+        pair_energy, overlaps = self._soft.measure() if self._soft is not None else (0.0, np.zeros(len(model.bodies)))
         penetrations = np.zeros(len(model.bodies))
         np.maximum.at(penetrations, model.chunk_body.numpy(), sums[:, diagnostics.DEPTH])
         return {
             "kinetic": float(total[diagnostics.KINETIC]),
             "elastic": float(self._elastic.numpy()[0]),
             "potential": float(total[diagnostics.POTENTIAL]),
-            "contact": float(total[diagnostics.CONTACT]) + self._pair_energy(),
+            "contact": float(total[diagnostics.CONTACT]) + pair_energy,
             "spring_losses": float(self.state.spring_losses.numpy().sum()),
             "field_work": float(self.state.field_work.numpy().sum()),
             "contact_losses": float(contact_losses[0]),
@@ -251,6 +243,7 @@ class Simulator:
             "angular_momentum": total[diagnostics.ANGULAR_MOMENTUM :][:3].copy(),
             "max_speed": float(greatest[diagnostics.SPEED]),
             "penetrations": penetrations,
+            "overlaps": overlaps,
             "contacts": int(total[diagnostics.CONTACTS]),
         }
 
@@ -280,12 +273,6 @@ class Simulator:
             )
             for body in model.bodies
         ]
-
-    @property
-    def _culls_pairs(self) -> bool:
-        """Whether only those particles search for others that are near another body."""
-        skin = self.model.skin
-        return skin is not None and not skin.with_itself and self.scene.solver.culling
 
     @staticmethod
     def _copy(rows: wp.array) -> np.ndarray:
@@ -374,62 +361,6 @@ class Simulator:
             [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
         )
 
-    def _build_grid(self) -> None:
-        """Sort the particles of the skin into the grid, at their current positions."""
-        skin: Any = self.model.skin
-        self._launch(pairs.gather_skin, len(skin.particles), [skin, self.state.x], [self._skin_points])
-        # Cells of two balls' width: fewer of them to search than of one, and hardly more balls.
-        self._grid.build(self._skin_points, 4.0 * skin.greatest_radius)
-
-    def _search_pairs(self, *, loss_weight: float) -> None:
-        """Add the forces between particles."""
-        model = self.model
-        self._build_grid()
-        self._launch(
-            pairs.add_pair_forces,
-            len(self._skin_points),
-            [
-                *(model.skin, model.particle_mass, self._near_lower, self._near_upper),
-                *(wp.uint64(self._grid.id), self._skin_points, self.state.v),
-                *(model.real(self.dt), model.real(loss_weight), self._culls_pairs),
-            ],
-            [self.state.f, self.state.pair_losses],
-        )
-
-    def _add_pair_forces(self, *, loss_weight: float) -> None:
-        """Add the forces between particles; without a search where no body is near another one."""
-        if not self._culls_pairs:
-            self._search_pairs(loss_weight=loss_weight)
-            return
-        model = self.model
-        boxes, body_boxes = [self._lower, self._upper], [self._body_lower, self._body_upper]
-        self._launch(bounds.update_body_bounds, len(model.bodies), [model.body_chunk_start, *boxes], body_boxes)
-        self._meetings.zero_()
-        self._launch(
-            pairs.find_meetings,
-            len(model.chunk_body),
-            [model.chunk_body, model.body_chunk_start, model.skin, *boxes, *body_boxes],
-            [self._near_lower, self._near_upper, self._meetings],
-        )
-        if self.device == "cpu":
-            wp.capture_if(self._meetings, self._search_pairs, loss_weight=loss_weight)
-        else:
-            # Conditional parts of CUDA graphs may not copy from memory of the host, as the build of a grid does.
-            self._search_pairs(loss_weight=loss_weight)
-
-    def _pair_energy(self) -> float:
-        """Return the energy stored in overlaps of particles, J."""
-        if self.model.skin is None:
-            return 0.0
-        self._build_grid()
-        self._launch(
-            pairs.measure_pairs,
-            len(self._skin_points),
-            [self.model.skin, wp.uint64(self._grid.id), self._skin_points],
-            [self._pair_energies],
-        )
-        return float(self._pair_energies.numpy().sum())
-
     def _add_forces(self, *, loss_weight: float, offset: float = 0.0, first: bool = True) -> None:
         """Overwrite the forces with those at the current positions and velocities.
 
@@ -460,11 +391,11 @@ class Simulator:
         )
         chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES
         has_colliders = len(model.colliders.kind) > 0
-        if self._culls_pairs or (has_colliders and self.scene.solver.culling):
-            boxes = [self._lower, self._upper]
+        boxes = [self._lower, self._upper]
+        if (self._soft is not None and self._soft.culls) or (has_colliders and self.scene.solver.culling):
             self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], boxes)
-        if model.skin is not None:
-            self._add_pair_forces(loss_weight=loss_weight)
+        if self._soft is not None:
+            self._soft.add_forces(*boxes, dt=self.dt, loss_weight=loss_weight)
         if not has_colliders:
             return
         self._launch(
@@ -472,7 +403,7 @@ class Simulator:
             (chunk_count, lanes),
             [
                 *(model.particle_mass, model.chunk_start, model.chunk_body, model.colliders),
-                *(self._lower, self._upper, state.x_start, state.x, state.v, state.step),
+                *(*boxes, state.x_start, state.x, state.v, state.step),
                 *(model.real(self.dt), weight, first, self.scene.solver.culling, lanes),
             ],
             [state.stamps, state.normals, state.f, state.contact_losses],

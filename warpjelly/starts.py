@@ -1,4 +1,4 @@
-"""What is seldom meant of how a scene starts: bodies in colliders, and planes through bodies."""
+"""What is seldom meant of how a scene starts: bodies in colliders or in each other, and planes through bodies."""
 
 from __future__ import annotations
 
@@ -11,15 +11,16 @@ from .simulator import Simulator
 
 log = logging.getLogger("warpjelly")
 
-# A body that starts deeper than this in a collider, in unit cells, is thrown out of it.
+# A body that starts deeper than this in a collider or in another body, in unit cells, is thrown out of it.
 DEEP_START = 0.05
 
 
 def warn_of_deep_starts(sim: Simulator) -> None:
-    """Warn of each body that starts deep in a collider, before the first step."""
+    """Warn of each body that starts deep in a collider or in another body, before the first step."""
+    measured = sim.diagnostics()
     positions = sim.positions
     planes = [collider for collider in sim.scene.colliders if isinstance(collider, PlaneCollider)]
-    for body, depth in zip(sim.model.bodies, sim.diagnostics()["penetrations"], strict=True):
+    for body, depth in zip(sim.model.bodies, measured["penetrations"], strict=True):
         cuts = [(_cut_depth(plane, positions[body.particles]), plane) for plane in planes]
         deepest, plane = max(cuts, key=lambda cut: cut[0], default=(0.0, None))
         if plane is not None and deepest > plane.threshold:
@@ -30,6 +31,17 @@ def warn_of_deep_starts(sim: Simulator) -> None:
             )
         elif depth > DEEP_START * body.unit:
             log.warning("body '%s' starts %.3g m deep in a collider and will be thrown out of it", body.name, depth)
+    overlapping = [
+        (body.name, overlap)
+        for body, overlap in zip(sim.model.bodies, measured["overlaps"], strict=True)
+        if overlap > DEEP_START * body.unit
+    ]
+    if overlapping:
+        log.warning(
+            "bodies %s start too close together: the balls around their particles overlap by up to %.3g m and will be "
+            "pushed apart; move them, or lower soft_contact.radius",
+            *(", ".join(f"'{name}'" for name, _ in overlapping), max(overlap for _, overlap in overlapping)),
+        )
 
 
 def _cut_depth(plane: PlaneCollider, points: np.ndarray) -> float:
