@@ -31,6 +31,11 @@ SWITCHED_OFF = [
     ("magnetic_cube", {"fields": []}, "reach"),
     ("pile", {"soft_contact.mode": "off"}, "rest_height"),
     ("rolling_off_sphere", {"colliders.ball.static_friction": 0.0, "colliders.ball.dynamic_friction": 0.0}, "rotation"),
+    (
+        "rolling_off_sphere",
+        {"colliders.ball.static_friction": 0.0, "colliders.ball.dynamic_friction": 0.0},
+        "displacement",
+    ),
     ("soft_plane", {"colliders.floor.stiffness": 2000.0}, "rest_height"),
     ("stiff_plane", {"colliders.floor.stiffness": 500.0, "colliders.floor.damping": 5.0}, "bounce"),
     ("three_networks", {"materials.with_shear.shear": NO_SPRING}, "shape_error"),
