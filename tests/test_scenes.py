@@ -22,6 +22,9 @@ SWITCHED_OFF = [
     ("falling_cloth", {"colliders.ball.center": [100.0, 0.0, 0.0]}, "rest_height"),
     ("force_grid", {"fields": []}, "reach"),
     ("hanging_cloth", {"bodies.cloth.pinned": []}, "rest_height"),
+    ("hanging_cloth", {"materials.cloth.shear": NO_SPRING}, "rest_height"),
+    ("hanging_cloth", {"materials.cloth.shear": NO_SPRING}, "shape_error"),
+    ("hanging_cloth", {"materials.cloth.bend": NO_SPRING}, "rest_height"),
     ("incline_holds", {"colliders.slope.static_friction": 0.4}, "displacement"),
     (
         "incline_slides",
