@@ -12,6 +12,7 @@ SCENES = Path(__file__).parent.parent / "scenes"
 NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
 KINDS = ("structural", "shear", "bend")
 NO_SPRING = {"stiffness": 0.0, "damping": 0.0}
+SOFT_SPRING = {"stiffness": 1.0, "damping": 0.1}
 
 # What each scene shows, switched off, and the expectation that has to notice.
 SWITCHED_OFF = [
@@ -42,8 +43,11 @@ SWITCHED_OFF = [
     ("soft_plane", {"colliders.floor.stiffness": 2000.0}, "rest_height"),
     ("stiff_plane", {"colliders.floor.stiffness": 2000.0}, "bounce"),
     ("stiff_plane", {"solver.dt": 5e-4}, "bounce"),
+    ("three_networks", {"materials.structural_only.shear": SOFT_SPRING}, "shape_error"),
     ("three_networks", {"materials.with_shear.shear": NO_SPRING}, "shape_error"),
+    ("three_networks", {"materials.with_shear.bend": SOFT_SPRING}, "shape_error"),
     ("three_networks", {"materials.with_bend.shear": NO_SPRING}, "shape_error"),
+    ("three_networks", {"materials.with_bend.bend": NO_SPRING}, "shape_error"),
     ("two_masses", {"materials.spring.structural.stiffness": 6.0}, "shape_error"),
     ("jello_cube", {"colliders": []}, "rest_height"),
     ("jello_cube", {"colliders": []}, "bounce"),
