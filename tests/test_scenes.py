@@ -12,6 +12,7 @@ SCENES = Path(__file__).parent.parent / "scenes"
 NAMES = sorted(path.stem for path in SCENES.glob("*.toml"))
 KINDS = ("structural", "shear", "bend")
 NO_SPRING = {"stiffness": 0.0, "damping": 0.0}
+SOFT_SPRING = {"stiffness": 1.0, "damping": 0.1}
 
 # What each scene shows, switched off, and the expectation that has to notice.
 SWITCHED_OFF = [
@@ -22,6 +23,9 @@ SWITCHED_OFF = [
     ("falling_cloth", {"colliders.ball.center": [100.0, 0.0, 0.0]}, "rest_height"),
     ("force_grid", {"fields": []}, "reach"),
     ("hanging_cloth", {"bodies.cloth.pinned": []}, "rest_height"),
+    ("hanging_cloth", {"materials.cloth.shear": NO_SPRING}, "rest_height"),
+    ("hanging_cloth", {"materials.cloth.shear": NO_SPRING}, "shape_error"),
+    ("hanging_cloth", {"materials.cloth.bend": NO_SPRING}, "rest_height"),
     ("incline_holds", {"colliders.slope.static_friction": 0.4}, "displacement"),
     (
         "incline_slides",
@@ -31,10 +35,19 @@ SWITCHED_OFF = [
     ("magnetic_cube", {"fields": []}, "reach"),
     ("pile", {"soft_contact.mode": "off"}, "rest_height"),
     ("rolling_off_sphere", {"colliders.ball.static_friction": 0.0, "colliders.ball.dynamic_friction": 0.0}, "rotation"),
+    (
+        "rolling_off_sphere",
+        {"colliders.ball.static_friction": 0.0, "colliders.ball.dynamic_friction": 0.0},
+        "displacement",
+    ),
     ("soft_plane", {"colliders.floor.stiffness": 2000.0}, "rest_height"),
-    ("stiff_plane", {"colliders.floor.stiffness": 500.0, "colliders.floor.damping": 5.0}, "bounce"),
+    ("stiff_plane", {"colliders.floor.stiffness": 2000.0}, "bounce"),
+    ("stiff_plane", {"solver.dt": 5e-4}, "bounce"),
+    ("three_networks", {"materials.structural_only.shear": SOFT_SPRING}, "shape_error"),
     ("three_networks", {"materials.with_shear.shear": NO_SPRING}, "shape_error"),
+    ("three_networks", {"materials.with_shear.bend": SOFT_SPRING}, "shape_error"),
     ("three_networks", {"materials.with_bend.shear": NO_SPRING}, "shape_error"),
+    ("three_networks", {"materials.with_bend.bend": NO_SPRING}, "shape_error"),
     ("two_masses", {"materials.spring.structural.stiffness": 6.0}, "shape_error"),
     ("jello_cube", {"colliders": []}, "rest_height"),
     ("jello_cube", {"colliders": []}, "bounce"),

@@ -17,7 +17,7 @@ FRAMES = {
     "cube_on_sphere": [0, 36, 56, 76, 130],
     "u_on_sphere": [0, 33, 45, 80, 239],
     "coupler_drop": [0, 17, 24, 51, 119],
-    "three_networks": [0, 20, 32, 60, 119],
+    "three_networks": [0, 20, 30, 60, 179],
     "pile": [0, 25, 45, 80, 179],
     "falling_cloth": [0, 18, 30, 45, 149],
 }
