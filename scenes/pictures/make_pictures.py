@@ -19,7 +19,7 @@ FRAMES = {
     "coupler_drop": [0, 17, 24, 51, 119],
     "three_networks": [0, 20, 32, 60, 119],
     "pile": [0, 25, 45, 80, 179],
-    "falling_cloth": [0, 18, 30, 45, 149],
+    "falling_cloth": [0, 17, 24, 35, 149],
 }
 
 
