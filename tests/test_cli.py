@@ -237,11 +237,14 @@ def test_an_interrupted_run_keeps_its_frames(warpjelly, tmp_path, monkeypatch):
         (["run", CUBE, "--set", "bodies.cube.velocity=[0.0, -1e12, 0.0]"], "bodies.0.velocity.1"),
         (["run", CUBE, "--set", "gravity=[0.0, -1e12, 0.0]"], "gravity.1"),
         (["run", CUBE, "--set", "fps=" + 5000 * "9"], "fps"),
+        (["run", CUBE, "--set", "fps=" + 3000 * "["], "fps"),
+        (["run", CUBE, "--set", "bodies.².size=3"], "no entry '²'"),
         (["fly"], "fly"),
         (["validate", "none.usdc"], "none.usdc"),
         (["preview", "none.usdc", "-o", "a.png"], "none.usdc"),
         (["preview", "none.usdc"], "output"),
         (["preview", "none.usdc", "-o", "a.png", "--size", "big"], "--size big"),
+        (["preview", "none.usdc", "-o", "a.png", "--size", "²x3"], "--size ²x3"),
     ],
 )
 def test_wrong_arguments_exit_with_2_and_one_line(warpjelly, tmp_path, monkeypatch, arguments, said):

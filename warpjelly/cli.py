@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import tomllib
@@ -182,13 +183,12 @@ def preview(
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of a frame in pixels.")] = "960x540",
 ) -> None:
     """Look at a result without a USD viewer."""
-    width, _, height = size.partition("x")
-    if not (width.isdigit() and height.isdigit()):
+    if not (sides := re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size)):
         raise InputError(f"--size {size}: give width x height in pixels, for example 960x540")
 
     from .preview import render_preview
 
-    render_preview(source, output, frames=frames or None, size=(int(width), int(height)))
+    render_preview(source, output, frames=frames or None, size=(int(sides[1]), int(sides[2])))
     print(f"picture: {output}")
 
 
@@ -295,7 +295,7 @@ def _overrides(settings: list[str]) -> dict[str, Any]:
             raise InputError(f"--set {setting}: give KEY=VALUE, for example --set solver.dt=5e-4")
         try:
             overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
-        except ValueError:
+        except (ValueError, RecursionError):
             overrides[key.strip()] = text.strip()
     return overrides
 
