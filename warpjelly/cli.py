@@ -10,12 +10,14 @@ import signal
 import sys
 import tomllib
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from .errors import EnvironmentFailedError, InputError, WarpjellyError
+from .errors import EnvironmentFailedError, InputError, SceneError, WarpjellyError
 
 if TYPE_CHECKING:
     from .expect import Outcome
@@ -91,17 +93,20 @@ def run(
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("frames  {task.fields[rate]}"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-        console=Console(stderr=True),
-        disable=quiet or not sys.stderr.isatty(),
-        transient=True,
-    ) as bar:
+    with (
+        _named(scene),
+        Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames  {task.fields[rate]}"),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            console=Console(stderr=True),
+            disable=quiet or not sys.stderr.isatty(),
+            transient=True,
+        ) as bar,
+    ):
         task = bar.add_task("building", total=loaded.frame_count, rate="")
 
         def show(done: int, total: int) -> None:
@@ -137,7 +142,8 @@ def check(
 
     from .run import forecast
 
-    figures = forecast(loaded, device=device)
+    with _named(scene):
+        figures = forecast(loaded, device=device)
     if as_json:
         print(json.dumps(figures))
         return
@@ -204,7 +210,8 @@ def export_world(
 
     from .worldfile import write_world
 
-    write_world(loaded, output, force=force)
+    with _named(scene):
+        write_world(loaded, output, force=force)
     print(f"world: {output}")
 
 
@@ -304,6 +311,15 @@ def _load(path: Path, overrides: dict[str, Any], frames: int | None) -> Scene:
     from .scenefile import load_scene
 
     return load_scene(path, overrides=overrides, frames=frames)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name the scene file where its scene cannot be built, as errors of validation do."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
 
 
 def _summarize(record: dict[str, Any], outcomes: list[Outcome]) -> None:

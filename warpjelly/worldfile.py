@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import EnvironmentFailedError, InputError
+from .errors import EnvironmentFailedError, InputError, SceneError
 from .files import whole_file
 from .scene import (
     DEFAULT_PARTICLE_MASS,
@@ -266,8 +266,8 @@ def _format(scene: Scene) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _unfit(key: str, why: str) -> InputError:
-    return InputError(f"the scene does not fit a world file: {key} {why}")
+def _unfit(key: str, why: str) -> SceneError:
+    return SceneError(f"the scene does not fit a world file: {key} {why}")
 
 
 def _require(fits: bool, key: str, why: str) -> None:
