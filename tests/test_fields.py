@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import io
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -157,6 +161,65 @@ def test_a_bad_field_is_refused(tmp_path, changes: dict[str, Any], said: str) ->
         load_scene(path, overrides=forces | changes)
     assert said in str(caught.value)
     assert "fields.0" in str(caught.value)
+
+
+def save_damaged(path: Path) -> None:
+    """Write a .npz file in whose packed data some bytes are wrong."""
+    np.savez_compressed(path, np.random.default_rng(1).normal(size=(8, 3)))
+    data = bytearray(path.read_bytes())
+    data[60:100] = 40 * b"\xff"
+    path.write_bytes(data)
+
+
+def save_header(old: bytes, new: bytes) -> Callable[[Path], None]:
+    """Return what writes a .npy file with a changed header, padded to the length that it had."""
+
+    def save(path: Path) -> None:
+        packed = io.BytesIO()
+        np.save(packed, np.zeros((8, 3)))
+        data = packed.getvalue()
+        assert old in data
+        path.write_bytes(data.replace(old, new).replace(b" " * (len(new) - len(old)) + b"\n", b"\n", 1))
+
+    return save
+
+
+def save_text(path: Path) -> None:
+    """Write a .npz file that holds a text."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("readme.txt", "forces")
+
+
+@pytest.mark.parametrize(
+    ("name", "save", "said"),
+    [
+        ("damaged.npz", save_damaged, "decompressing"),
+        ("text.npz", save_text, "something else"),
+        ("header.npy", save_header(b"'descr'", b"'descr\""), "header"),
+        ("open.npy", save_header(b"'shape': (8, 3), }", b"'shape': (8, 3, 0 "), ""),
+        ("huge.npy", save_header(b"(8, 3)", b"(1000000, 1000000, 1000)"), "allocate"),
+        ("fields.npy", lambda path: np.save(path, np.zeros(8, [("x", float), ("y", float), ("z", float)])), "'x'"),
+        ("complex.npy", lambda path: np.save(path, np.zeros((8, 3), complex)), "complex128"),
+        ("dates.npy", lambda path: np.save(path, np.zeros((8, 3), "datetime64[s]")), "datetime64"),
+        ("words.npy", lambda path: np.save(path, np.full((8, 3), "1.0")), "<U3"),
+        ("flags.npz", lambda path: np.savez(path, np.zeros((8, 3), bool)), "bool"),
+    ],
+)
+def test_a_file_without_an_array_of_numbers_is_refused(
+    tmp_path: Path, name: str, save: Callable[[Path], None], said: str
+) -> None:
+    """Name the file and what is wrong in one line, whatever reading it trips over."""
+    save(tmp_path / name)
+    (tmp_path / "scene.toml").write_text(
+        '[materials.m]\n[[bodies]]\ntype = "cube"\nmaterial = "m"\n[[fields]]\ntype = "grid"\n'
+        f'lower = [-1.0, -1.0, -1.0]\nupper = [1.0, 1.0, 1.0]\nfile = "{name}"\n'
+    )
+    with pytest.raises(InputError) as caught:
+        load_scene(tmp_path / "scene.toml")
+    message = str(caught.value)
+    assert f"fields.0: {tmp_path / name}: not a NumPy file with one array of numbers: " in message
+    assert said in message.split("numbers: ")[1]
+    assert "\n" not in message
 
 
 def make_charged(precision: str, fields: list[dict[str, Any]]) -> Any:

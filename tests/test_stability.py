@@ -17,7 +17,7 @@ from test_scenes import NAMES, SCENES
 from worlds import make_material, make_scene, set_state
 
 from warpjelly import stability
-from warpjelly.errors import DivergedError, InputError
+from warpjelly.errors import DivergedError, SceneError
 from warpjelly.run import forecast, simulate
 from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
@@ -401,7 +401,7 @@ def test_auto_names_the_integrators_that_would_do(monkeypatch: pytest.MonkeyPatc
         return dict.fromkeys(INTEGRATORS, None) | {"rk4": 1e-3}
 
     monkeypatch.setattr("warpjelly.simulator.step_limits", without)
-    with pytest.raises(InputError, match=r'solver.dt = "auto".*semi_implicit_euler.*rk4'):
+    with pytest.raises(SceneError, match=r'solver.dt = "auto".*semi_implicit_euler.*rk4'):
         Simulator(make_cube(2, UNDAMPED, solver={"dt": "auto"}), device="cpu")
 
 
