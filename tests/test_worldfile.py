@@ -149,6 +149,7 @@ def test_a_world_moves_like_the_reference(tmp_path: Path, name: str, device: str
         lambda text: " ".join(text.split()),
         lambda text: "\n\n  " + text.replace(" ", "\t\t \n") + "\n \n",
         lambda text: text.rstrip(),
+        lambda text: "\ufeff" + text,
         lambda text: text.replace("0.000500", "5e-4").replace("RK4", "RK4"),
     ],
 )
@@ -173,6 +174,7 @@ def test_all_names_of_the_integrators_are_known(tmp_path: Path) -> None:
     ("line", "text", "said"),
     [
         (1, "Verlet", "line 1: 'Verlet' is not an integrator"),
+        (1, 1000 * "\0", r"line 1: '\x00\x00\x00"),
         (1, "HAIR 3", "line 1: 'HAIR' is not an integrator"),
         (2, "0.0 1", "line 2: '0.0' is not the time step"),
         (2, "-0.0005 1", "line 2: '-0.0005' is not the time step"),
@@ -183,6 +185,8 @@ def test_all_names_of_the_integrators_are_known(tmp_path: Path) -> None:
         (3, "200 0.25 0 0.25", "line 3: dCollision is given, but kCollision is 0"),
         (3, "200 0.25 4OO 0.25", "line 3: '4OO' is not kCollision"),
         (4, "0.000000", "line 4: '0.000000' is not the mass"),
+        (4, "1e-10", "line 4: '1e-10' is not the mass"),
+        (4, 1000 * "x", "line 4: 'xxxxxxxxxxxx...xxxxxxxxxxxxx' is not the mass"),
         (5, "2", "line 5: '2' is not the flag"),
         (6, "0 0 0 1", "line 6: the inclined plane has no normal"),
         (7, "1", "line 7: a field of resolution 1"),
@@ -207,6 +211,8 @@ def test_a_bad_world_is_refused_by_its_line(tmp_path: Path, line: int, text: str
     with pytest.raises(InputError) as caught:
         load_scene(path)
     assert str(caught.value).startswith(f"{path}: {said}")
+    assert str(caught.value).isprintable()
+    assert len(str(caught.value)) < len(str(path)) + 150
 
 
 def test_a_truncated_world_is_refused_wherever_it_ends(tmp_path: Path) -> None:
@@ -243,8 +249,29 @@ def test_samples_of_a_world_are_whole_steps(tmp_path: Path, caplog: pytest.LogCa
     assert load_scene(path, overrides={"duration": 0.25}).frame_count == 500
     finer = load_scene(path, overrides={"solver.dt": 1e-4})
     assert (step_of(finer), finer.fps) == (1e-4, pytest.approx(1e4))
-    with pytest.raises(InputError, match="fps"):
-        load_scene(path, overrides={"fps": "many"})
+    # Steps that are asked for are taken, and another fps beside them is refused.
+    assert substeps_of(load_scene(path, overrides={"solver.steps_per_frame": 7})) == 7
+    assert substeps_of(load_scene(path, overrides={"solver.steps_per_frame": 8, "fps": 250})) == 8
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"fps": "many"}, 'fps = "many": must be a valid number'),
+        ({"fps": True}, "fps = true: must be a valid number"),
+        ({"fps": 0.05}, "fps = 0.05: must be greater than or equal to 0.1"),
+        ({"fps": 60, "solver.dt": "auto"}, 'solver.dt = "auto": give a number'),
+        ({"fps": 60, "solver.dt": 1e-320}, "solver.dt = 1e-320: must be greater than"),
+        ({"fps": 60, "solver.steps_per_frame": 7}, "fps = 60.0: leave it out; solver.steps_per_frame and solver.dt"),
+        ({"solver.dt": 1.0, "solver.steps_per_frame": 11}, "solver.steps_per_frame = 11: with solver.dt = 1 s that is"),
+    ],
+)
+def test_times_that_a_world_cannot_have_are_refused(tmp_path: Path, overrides: dict[str, Any], said: str) -> None:
+    """Blame the key that is wrong, and drop none of those given."""
+    path = write(tmp_path / "a.w", WORLDS["left"])
+    with pytest.raises(InputError) as caught:
+        load_scene(path, overrides=overrides)
+    assert str(caught.value).startswith(f"{path}: {said}")
 
 
 def test_exact_steps_decide_fps(tmp_path: Path) -> None:

@@ -45,6 +45,8 @@ MAX_FRAMES = 1_000_000
 MAX_SUBSTEPS = 1_000_000
 # Time steps beyond these [s] are typing errors.
 MIN_STEP, MAX_STEP = 1e-9, 1.0
+# Samples per second beyond these as well.
+MIN_FPS, MAX_FPS = 0.1, 1e9
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_MAGNITUDE)]
@@ -141,12 +143,6 @@ class Material(Table):
     bend: SpringConstants = Field(SpringConstants(), description="springs to the second neighbours along each axis")
 
     @model_validator(mode="after")
-    def _mass_is_given_once(self) -> Self:
-        if self.particle_mass is not None and self.density is not None:
-            raise PydanticCustomError("mass", "give particle_mass or density, not both")
-        return self
-
-    @model_validator(mode="after")
     def _keys_go_with_the_law(self) -> Self:
         young = self.law == "young"
         needed = ("youngs_modulus", "density") if young else ()
@@ -158,6 +154,12 @@ class Material(Table):
         for key in needed:
             if getattr(self, key) is None:
                 refuse(key, None, "missing; law young requires this key")
+        return self
+
+    @model_validator(mode="after")
+    def _mass_is_given_once(self) -> Self:
+        if self.particle_mass is not None and self.density is not None:
+            raise PydanticCustomError("mass", "give particle_mass or density, not both")
         return self
 
     @model_serializer(mode="wrap")
@@ -254,8 +256,12 @@ class VoxelsBody(Body):
     def _layers_form_a_grid(cls, layers: list[list[str]]) -> list[list[str]]:
         rows, width = len(layers[0]), len(layers[0][0]) if layers[0] else 0
         for y, layer in enumerate(layers):
-            if len(layer) != rows or any(len(row) != width for row in layer):
-                raise PydanticCustomError("layers", f"layer {y} has not the shape of layer 0 ({rows} rows of {width})")
+            if len(layer) != rows:
+                raise PydanticCustomError("layers", f"layer {y} has {len(layer)} rows, layer 0 has {rows}")
+            for z, row in enumerate(layer):
+                if len(row) != width:
+                    why = f"row {z} of layer {y} has {len(row)} cells, row 0 of layer 0 has {width}"
+                    raise PydanticCustomError("layers", why)
             if stray := set("".join(layer)) - {"#", "."}:
                 raise PydanticCustomError("layers", f"layer {y} has {min(stray)!r}; use # for a cube and . for none")
         if not any("#" in row for layer in layers for row in layer):
@@ -299,7 +305,9 @@ class Contact(Table):
     stiffness: Positive = Field(2000.0, description="N/m of penetration depth")
     damping: NotNegative = Field(1.0, description="N s/m along the normal")
     static_friction: NotNegative = Field(0.6, description="largest friction at rest, share of the normal force")
-    dynamic_friction: NotNegative = Field(0.4, description="friction in motion, share of the normal force")
+    dynamic_friction: NotNegative = Field(
+        0.4, description="friction in motion, share of the normal force; at most static_friction"
+    )
     pulls: Switch = Field(False, description="let the damper also pull a particle that leaves")
     normal_force_term: Switch = Field(
         False,
@@ -669,7 +677,7 @@ class Scene(Table):
     frames: int | None = Field(
         None, strict=True, ge=1, le=MAX_FRAMES, description="number of samples, instead of duration"
     )
-    fps: float = Field(60.0, strict=True, allow_inf_nan=False, ge=0.1, le=1e9, description="samples per second")
+    fps: float = Field(60.0, strict=True, allow_inf_nan=False, ge=MIN_FPS, le=MAX_FPS, description="samples per second")
     up_axis: Literal["Y", "Z"] = Field("Y", description="which axis points up")
     gravity: Rates | None = Field(None, description="m/s^2; 9.81 downwards unless given")
     solver: Solver = Field(Solver(), description="time integration")
@@ -705,7 +713,12 @@ class Scene(Table):
         # Whatever is no such number is refused where it belongs.
         counted = isinstance(steps, int) and 1 <= steps <= MAX_SUBSTEPS
         timed = isinstance(dt, float | int) and MIN_STEP <= dt <= MAX_STEP
-        return {**data, "fps": 1.0 / (steps * dt)} if counted and timed else data
+        if not (counted and timed):
+            return data
+        if steps * dt > 1.0 / MIN_FPS:
+            why = f"with solver.dt = {dt:g} s that is a sample every {steps * dt:g} s; at most {1.0 / MIN_FPS:g} s"
+            refuse("solver.steps_per_frame", steps, why)
+        return {**data, "fps": 1.0 / (steps * dt)}
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:
@@ -721,6 +734,13 @@ class Scene(Table):
             if not body.has_volume and material.density is not None:
                 why = f"it has a density, but a {body.type} has no volume: use particle_mass, and law strain or hooke"
                 refuse(f"bodies.{i}.material", body.material, why)
+        contacts = {f"colliders.{i}": self.contact_of(collider) for i, collider in enumerate(self.colliders)}
+        for key, contact in ({"contact": self.contact} | contacts).items():
+            if contact.dynamic_friction > contact.static_friction:
+                why = f"must not be above static_friction, which is {contact.static_friction:g}"
+                if key != "contact":
+                    why += "; [contact] has what a collider does not say"
+                refuse(f"{key}.dynamic_friction", contact.dynamic_friction, why)
         for key, _, expectation in self.expect.items():
             bodies = ", ".join(str(body.name) for body in self.bodies)
             if expectation.body is None and len(self.bodies) > 1:

@@ -104,7 +104,7 @@ def _identifier(text: str) -> str:
 # What pydantic says in terms of Python, in terms of a scene.
 _WORDS = {
     "tuple_type": "must be a list of numbers",
-    "list_type": "must be a list; tables of a list are headed [[bodies]], with two brackets",
+    "list_type": "must be a list",
     "dict_type": "must be a table",
     "model_type": "must be a table",
     "model_attributes_type": "must be a table",
@@ -121,6 +121,9 @@ def _explain(error: ValidationError) -> str:
     value = first["input"]
     key = _key(first["loc"])
     what = _WORDS.get(first["type"], first["msg"]).replace("Input should", "must").replace("Value should", "must")
+    if first["type"] == "list_type" and first["loc"][-1] in ("bodies", "colliders", "fields", "pinned"):
+        header = ".".join(part for part in key.split(".") if not part.isdigit())
+        what += f"; its tables are headed [[{header}]], with two brackets"
     if first["type"] in ("unknown_key", "scene"):
         key = ".".join(filter(None, [key, context["key"]]))
     if first["type"] == "unknown_key":

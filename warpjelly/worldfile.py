@@ -11,6 +11,7 @@ import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
+from reprlib import repr as shorten
 from typing import Any
 
 import numpy as np
@@ -19,9 +20,14 @@ from .errors import EnvironmentFailedError, InputError, SceneError
 from .files import whole_file
 from .scene import (
     DEFAULT_PARTICLE_MASS,
+    MAX_FPS,
     MAX_LENGTH,
     MAX_MAGNITUDE,
+    MAX_STEP,
     MAX_SUBSTEPS,
+    MIN_FPS,
+    MIN_MASS,
+    MIN_STEP,
     BoxCollider,
     ConstantField,
     CubeBody,
@@ -73,14 +79,14 @@ class _Tokens:
         """Take an integer between two bounds."""
         word = self.word(what)
         if not _INTEGER.fullmatch(word) or not least <= int(word) <= most:
-            raise self.refuse(f"{word!r} is not {what}, an integer from {least} to {most}")
+            raise self.refuse(f"{shorten(word)} is not {what}, an integer from {least} to {most}")
         return int(word)
 
     def number(self, what: str, least: float = -MAX_MAGNITUDE, most: float = MAX_MAGNITUDE) -> float:
         """Take a number between two bounds."""
         word = self.word(what)
         if not _NUMBER.fullmatch(word) or not least <= float(word) <= most:
-            raise self.refuse(f"{word!r} is not {what}, a number from {least:g} to {most:g}")
+            raise self.refuse(f"{shorten(word)} is not {what}, a number from {least:g} to {most:g}")
         return float(word)
 
     def vectors(self, count: int, what: str, most: float = MAX_MAGNITUDE) -> list[tuple[float, float, float]]:
@@ -100,23 +106,23 @@ def read_world(path: Path) -> dict[str, Any]:
         InputError: the file cannot be read, or is not a world; the message names the line.
     """
     try:
-        tokens = _Tokens(path, path.read_text(encoding="utf-8"))
+        tokens = _Tokens(path, path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as error:
         raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
     except OSError as error:
         raise InputError(f"{path}: cannot read the world: {error.strerror}") from error
     integrator = tokens.word("the integrator")
     if integrator not in INTEGRATORS:
-        raise tokens.refuse(f"{integrator!r} is not an integrator of jello cube worlds; they are Euler and RK4")
-    dt = tokens.number("the time step in s", 1e-9, 1.0)
+        raise tokens.refuse(f"{shorten(integrator)} is not an integrator of jello cube worlds; they are Euler and RK4")
+    dt = tokens.number("the time step in s", MIN_STEP, MAX_STEP)
     steps = tokens.integer("the number of steps per sample", 1, MAX_SUBSTEPS)
-    if not 1e-9 <= steps * dt <= 10.0:
-        raise tokens.refuse(f"a sample every {steps * dt:g} s; at most 10 s are allowed")
+    if steps * dt > 1.0 / MIN_FPS:
+        raise tokens.refuse(f"a sample every {steps * dt:g} s; at most {1.0 / MIN_FPS:g} s are allowed")
     stiffness, damping = tokens.number("kElastic in N/m", 0.0), tokens.number("dElastic in N s/m", 0.0)
     contact = {"stiffness": tokens.number("kCollision in N/m", 0.0), "damping": tokens.number("dCollision", 0.0)}
     if contact["stiffness"] == 0 and contact["damping"] > 0:
         raise tokens.refuse("dCollision is given, but kCollision is 0; it must be above 0, or both 0 for no collisions")
-    mass = tokens.number("the mass of a particle in kg", 1e-12)
+    mass = tokens.number("the mass of a particle in kg", MIN_MASS)
     colliders: list[dict[str, Any]] = [{"name": "box", "type": "box", "size": [2 * BOX_REACH] * 3}]
     if tokens.integer("the flag of the inclined plane", 0, 1) == 1:
         *normal, shift = (tokens.number(f"coefficient {name} of the inclined plane") for name in "abcd")
@@ -140,7 +146,7 @@ def read_world(path: Path) -> dict[str, Any]:
     velocities = tokens.vectors(PARTICLES_PER_EDGE**3, "the velocities")
     if tokens.next < len(tokens.words):
         extra = tokens.word("nothing")
-        raise tokens.refuse(f"{extra!r} follows after the last velocity, where the file should end")
+        raise tokens.refuse(f"{shorten(extra)} follows after the last velocity, where the file should end")
     constants = {"stiffness": stiffness, "damping": damping}
     return {
         "up_axis": "Z",
@@ -180,17 +186,17 @@ def read_world(path: Path) -> dict[str, Any]:
 def settle_time(path: Path, data: dict[str, Any], overrides: Mapping[str, Any]) -> dict[str, Any]:
     """Return the overrides of a world without fps, which its exact step decides; give the world its length.
 
-    A wish for fps becomes the nearest whole number of steps per sample, and the log says so.
+    A wish for fps becomes the nearest whole number of steps per sample, and the log says so. It stays where the scene
+    refuses it, or the step, and where the overrides say the number of steps themselves.
     """
     overrides = dict(overrides)
     if "duration" not in overrides:
         data["frames"] = DEFAULT_FRAMES
-    wish = overrides.pop("fps", None)
-    if wish is None:
+    wish, dt = overrides.get("fps"), overrides.get("solver.dt", data["solver"]["dt"])
+    sound = _is_number(wish, MIN_FPS, MAX_FPS) and _is_number(dt, MIN_STEP, MAX_STEP)
+    if not sound or overrides.keys() & {"solver", "solver.steps_per_frame"}:
         return overrides
-    dt = overrides.get("solver.dt", data["solver"]["dt"])
-    if not all(isinstance(number, int | float) and 1e-9 <= number <= 1e9 for number in (wish, dt)):
-        raise InputError(f"--set fps = {wish!r}: must be a number of samples per second")
+    del overrides["fps"]
     steps = max(1, round(1.0 / (wish * dt)))
     overrides["solver.steps_per_frame"] = steps
     log.warning(
@@ -198,6 +204,10 @@ def settle_time(path: Path, data: dict[str, Any], overrides: Mapping[str, Any]) 
         path, steps, dt, 1.0 / (steps * dt), wish,
     )  # fmt: skip
     return overrides
+
+
+def _is_number(value: Any, least: float, most: float) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and least <= value <= most
 
 
 def write_world(scene: Scene, path: str | Path, *, force: bool = False) -> None:
