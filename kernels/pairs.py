@@ -227,7 +227,7 @@ def add_pair_forces(
 
 
 @wp.kernel
-def measure_pairs(
+def measure_overlaps(
     # Model:
     skin: Any,
     # State in:

@@ -68,6 +68,7 @@ class Bounce:
             solver={"integrator": integrator, "dt": dt, "steps_per_frame": 1}, fps=1.0 / dt,
         )  # fmt: skip
         simulator = Simulator(scene, device="cpu")
+        self.warning = simulator.broken_limit()
         rng, count = np.random.default_rng(17), len(simulator.masses)
         # Contact lasts half a period, pi / (w (1 - zeta^2)^0.5), zeta <= 0.36, and a step or two at both ends.
         frequency = math.sqrt(STIFFNESS / mass)
@@ -141,6 +142,19 @@ def test_no_bounce_gains_with_defaults(integrator: str, kind: str) -> None:
         bounce = Bounce(kind, integrator, share * limit, mass=mass, contact={})
         assert bounce.turned.all()
         assert (bounce.after <= bounce.before).all(), (mass, share)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_what_may_gain_at_the_default_step_is_warned_of(integrator: str) -> None:
+    """Bounce particles of all masses with everything as by default: no bounce gains that no warning tells of."""
+    warned = []
+    for mass in (0.0003, 0.0008, 0.001, 0.002, 0.005, 0.01, 0.1, 1.0):
+        bounce = Bounce("half_space", integrator, 1e-3, mass=mass, contact={})
+        warned.append(bounce.warning is not None)
+        assert warned[-1] or (bounce.after <= bounce.before).all(), mass
+    # Light ones are, the default of 10 g is not; but explicit Euler's limit in contact, c/k, is half of the step.
+    assert warned[0]
+    assert warned[5] == (integrator == "explicit_euler")
 
 
 @pytest.mark.parametrize("kind", DEFAULTS)
@@ -282,7 +296,8 @@ def test_thrown_cubes_gain_no_energy(integrator: str, kind: str, damping: float)
     assert found[-1] < 0.9 * found[0]
 
 
-# The scenes that are to stay in one piece with their own step.
+# The scene of a contact that is too stiff for its step, and those that are to stay in one piece with theirs.
+TOO_STIFF = "stiff_plane"
 LASTING = [name for name in NAMES if load_scene(SCENES / f"{name}.toml").expect.diverges is None]
 
 
@@ -291,7 +306,13 @@ def losses(measured: dict[str, Any]) -> float:
     return float(sum(measured[name] for name in ("spring_losses", "contact_losses", "friction_losses")))
 
 
-@pytest.mark.parametrize("name", LASTING)
+def test_only_the_scene_that_is_about_it_may_gain() -> None:
+    """Warn of steps with which contacts may gain energy in the scene that shows it, and in no other that lasts."""
+    warned = [name for name in LASTING if Simulator(load_scene(SCENES / f"{name}.toml"), device="cpu").broken_limit()]
+    assert warned == [TOO_STIFF]
+
+
+@pytest.mark.parametrize("name", [name for name in LASTING if name != TOO_STIFF])
 def test_no_scene_gains_energy(name: str) -> None:
     """Run each scene with its own settings: energy, less what fields gave, never rises above what it was before.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import logging
 import math
@@ -106,7 +107,7 @@ def test_lanczos_finds_the_top_of_the_assembled_matrix(damped: bool, precision: 
     """Find the top eigenvalue within 1 % from below, and damping / stiffness times it."""
     material = make_material(400.0, 0.6 if damped else 0.0, density=300.0)
     simulator = Simulator(make_cube(5, material, solver={"precision": precision}), device=device)
-    origin, (top, damping) = stability.measure_pairs(simulator.model, simulator.state.x)
+    origin, (top, damping) = stability.bound_spring_pairs(simulator.model, simulator.state.x)
     expected = np.linalg.eigvalsh(Matrices(simulator).a)[-1]
     assert (origin == 0).all()
     # Rounding can put it above by some epsilons.
@@ -118,7 +119,7 @@ def test_the_polygon_holds_the_pairs_of_unequal_springs() -> None:
     """Enclose (a, d) of random shapes and of the top modes, within 2 % of the top values."""
     simulator = Simulator(make_cube(4, MIXED), device="cpu")
     matrices = Matrices(simulator)
-    pairs = stability.measure_pairs(simulator.model, simulator.state.x)
+    pairs = stability.bound_spring_pairs(simulator.model, simulator.state.x)
     scale = pairs.max(axis=0)
     tops = [np.linalg.eigvalsh(matrix)[-1] for matrix in (matrices.a, matrices.b)]
     np.testing.assert_allclose(scale, tops, rtol=0.01)
@@ -256,20 +257,128 @@ def test_contact_alone_gives_the_limits_of_an_oscillator() -> None:
         assert abs(np.polyval(coefficients, 0.999 * limit * mu)) < 1 < abs(np.polyval(coefficients, 1.001 * limit * mu))
 
 
+FLOOR = {"type": "half_space", "normal": [0.0, 1.0, 0.0], "center": [0.0, -1.0, 0.0], "damping": 0.5}
+BALL = {"type": "sphere", "center": [0.0, -2.0, 0.0], "radius": 1.5, "damping": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("colliders", "times"),
+    [
+        ([FLOOR], 1.0),
+        # Which all push the same way, ...
+        ([FLOOR, {**FLOOR, "type": "plane", "size": [1.0, 1.0]}, FLOOR], 3.0),
+        # ... or at right angles, or face each other, or both, ...
+        ([FLOOR, {**FLOOR, "normal": [1.0, 0.0, 0.0]}], 1.0),
+        ([FLOOR, {**FLOOR, "normal": [0.0, -1.0, 0.0], "center": [0.0, 1.0, 0.0]}], 1.0),
+        ([{"type": "box", "size": [4.0, 4.0, 4.0], "damping": 0.5}], 1.0),
+        # ... unless there is something between them; or at 60 degrees, n n^T + m m^T having 1 + n.m.
+        ([FLOOR, {**FLOOR, "normal": [0.0, -1.0, 0.0], "center": [0.0, -1.1, 0.0]}], 2.0),
+        ([FLOOR, {**FLOOR, "normal": [3.0**0.5, 1.0, 0.0]}], 1.5),
+        # A ball pushes any way: with another one that it meets, and with the floor that it sticks out of.
+        ([BALL, {**BALL, "center": [0.0, 3.0, 0.0]}], 1.0),
+        ([BALL, {**BALL, "center": [0.0, 0.9, 0.0]}], 2.0),
+        ([BALL, FLOOR], 2.0),
+        ([BALL, {**FLOOR, "center": [0.0, -4.0, 0.0]}], 1.0),
+    ],
+)  # fmt: skip
+def test_colliders_that_meet_add_up(colliders: list[dict[str, Any]], times: float) -> None:
+    """Count the stiffness and damping of what one particle may be in at once, as far as it acts one way."""
+    scene = make_cube(2, make_material(0.0, 0.0), colliders=colliders, contact={"stiffness": 2000.0})
+    ((a, d),) = np.unique(
+        stability.contact_pairs(Simulator(scene, device="cpu").model).max(axis=0, keepdims=True), axis=0
+    )
+    # float32 is not involved; rounding of directions is.
+    assert a == pytest.approx(times * 2000.0 / 0.01, rel=1e-9)
+    assert d == pytest.approx(times * 0.5 / 0.01, rel=1e-9)
+
+
+def test_sets_that_meet_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Find the same greatest sets of balls that all meet as by trying all sets, and no less where there are many."""
+    rng = np.random.default_rng(6)
+    for count in (1, 5, 9):
+        balls = [{"type": "sphere", "center": rng.uniform(-2, 2, 3).tolist(), "radius": 1.0} for _ in range(count)]
+        table = Simulator(make_cube(2, UNDAMPED, colliders=balls), device="cpu").model.colliders
+        centers = table.center.numpy()
+        meet = np.linalg.norm(centers[:, None] - centers, axis=2) <= 2.0
+        every = [
+            set(members)
+            for size in range(1, count + 1)
+            for members in itertools.combinations(range(count), size)
+            if meet[np.ix_(members, members)].all()
+        ]
+        greatest = {frozenset(members) for members in every if not any(members < other for other in every)}
+        assert {frozenset(members) for members in stability._touched_together(table)} == greatest
+        monkeypatch.setattr("warpjelly.stability.MAX_SORTED_OUT", 0)
+        many = [set(members) for members in stability._touched_together(table)]
+        monkeypatch.undo()
+        assert all(any(members <= other for other in many) for members in greatest)
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_resting_on_several_floors_is_bounded_at_the_limit(integrator: str) -> None:
+    """Rest on a floor that is there four times, at 0.95 of its limit and at the step of auto."""
+    drop = {"colliders": [FLOOR] * 4, "gravity": [0.0, -9.81, 0.0], "contact": {"stiffness": 2000.0}, "fps": 1000.0}
+    scene = make_cube(2, make_material(0.0, 0.0), solver={"integrator": integrator, "dt": "auto"}, **drop)
+    simulator = Simulator(scene, device="cpu")
+    limit = simulator.step_limits(contacts=True)[integrator]
+    assert limit is not None
+    steps = {"steps_per_frame": 1, "dt": 0.95 * limit, "integrator": integrator}
+    at_limit = Simulator(
+        make_cube(2, make_material(0.0, 0.0), solver=steps, **drop | {"fps": 1 / (0.95 * limit)}), device="cpu"
+    )
+    for tried in (simulator, at_limit):
+        x = tried.positions
+        x[:, 1] = -1.0
+        set_state(tried, x=x)
+        tried.step(round(1.0 / tried.dt))
+        # From rest at the surface it sinks in by 2 m g / k = 0.02 mm with all four, and comes back.
+        assert tried.positions[:, 1].max() <= -1.0 + 1e-3
+
+
+def test_magnetic_fields_have_limits() -> None:
+    """Gain 5 % of energy over the run at the limit of the Euler schemes and of RK2, and none below that of RK4."""
+    turns = [{"type": "magnetic", "strength": [0.0, 3.0, 0.0], "curve": [[0.0, 0.5], [1.0, 1.0]]},
+             {"type": "magnetic", "strength": [0.0, 2.0, 0.0]}]  # fmt: skip
+    body = {"type": "cube", "material": "jelly", "particles_per_edge": 2, "charge": 0.02, "velocity": [1.0, 0.0, 0.0]}
+    parts = {"bodies": [body], "materials": {"jelly": make_material(0.0, 0.0)}, "duration": 1.0, "frames": None}
+    for integrator in INTEGRATORS:
+        scene = make_scene(fields=turns, solver={"integrator": integrator}, **parts)
+        limit = stability.magnetic_limits(Simulator(scene, device="cpu").model, 1.0)[integrator]
+        # w = 0.02 C x 5 T / 0.01 kg, at the peak of the curves.
+        w, gain = 10.0, math.log(1.05)
+        expected = {"rk2": (4 * gain / w**4) ** (1 / 3), "rk4": 8**0.5 / w}.get(integrator, gain / w**2)
+        assert limit == pytest.approx(expected, rel=1e-6)
+        # At the peak all the time the energy grows by 5 %, to the next order of (w dt)^2.
+        steady = [{"type": "magnetic", "strength": [0.0, 5.0, 0.0]}]
+        solver = {"integrator": integrator, "steps_per_frame": 1, "dt": limit}
+        simulator = Simulator(make_scene(fields=steady, solver=solver, fps=1 / limit, **parts), device="cpu")
+        before = simulator.diagnostics()["kinetic"]
+        simulator.step(round(1 / limit))
+        grown = simulator.diagnostics()["kinetic"] / before
+        if integrator == "rk4":
+            assert grown <= 1.0
+        else:
+            assert grown == pytest.approx(1.05, rel=0.01)
+        auto = Simulator(
+            make_scene(fields=turns, solver={"integrator": integrator, "dt": "auto"}, **parts), device="cpu"
+        )
+        assert auto.dt <= limit
+
+
 def test_pinned_particles_do_not_move() -> None:
     """Leave particles of zero inverse mass out: a body held at one end is not less stable than a free one."""
     simulator = Simulator(make_cube(4, ALL_LIMITED), device="cpu")
-    free = stability.measure_pairs(simulator.model, simulator.state.x)[1, 0]
+    free = stability.bound_spring_pairs(simulator.model, simulator.state.x)[1, 0]
     inverse = simulator.model.particle_inv_mass.numpy().copy()
     inverse[simulator.positions[:, 0] < 0.0] = 0.0
     simulator.model.particle_inv_mass.assign(inverse)
-    held = stability.measure_pairs(simulator.model, simulator.state.x)[1, 0]
+    held = stability.bound_spring_pairs(simulator.model, simulator.state.x)[1, 0]
     kept = np.repeat(inverse > 0, 3)
     expected = np.linalg.eigvalsh(Matrices(simulator).a[np.ix_(kept, kept)])[-1]
     assert 0.99 * expected <= held <= expected * (1 + 1e-9)
     assert held < free
     simulator.model.particle_inv_mass.zero_()
-    assert stability.measure_pairs(simulator.model, simulator.state.x)[1, 0] == 0
+    assert stability.bound_spring_pairs(simulator.model, simulator.state.x)[1, 0] == 0
 
 
 def test_auto_takes_a_safe_step_that_divides_the_frame() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import threading
 from typing import Any
 
@@ -17,7 +18,17 @@ from .model import Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
 from .softcontact import SoftContact
-from .stability import SAFETY, add_contacts, measure_pairs, step_limits
+from .stability import (
+    BOUNCE_SHARE,
+    MAGNETIC_GAIN,
+    SAFETY,
+    add_contacts,
+    bounce_limits,
+    bound_spring_pairs,
+    contact_pairs,
+    magnetic_limits,
+    step_limits,
+)
 from .surface import SurfaceFrame
 
 log = logging.getLogger("warpjelly")
@@ -75,7 +86,9 @@ class Simulator:
         culling = self.scene.solver.culling
         self._soft = SoftContact(self.model, self.state, culling=culling) if self.model.skin is not None else None
         self._graphs: dict[int, Any] = {}
-        self._capturable = True
+        # On a GPU a graph would build grids from memory of the host that all of Warp's grids of one precision share:
+        # another simulator in this process would put its own there.
+        self._capturable = self._soft is None or self.device == "cpu"
         # Kernels compile at their first launch, which must not be inside a capture; a step of no time changes nothing.
         self._add_forces(loss_weight=0.0)
         if scratch:
@@ -102,13 +115,18 @@ class Simulator:
 
     @property
     def forces(self) -> np.ndarray:
-        """Total forces of the last substep (at the start, those at time zero), [particle_count, 3], N; a copy."""
+        """Total forces of the last evaluation (at the start, those at time zero), [particle_count, 3], N; a copy."""
         return self._copy(self.state.f)
 
     @property
     def masses(self) -> np.ndarray:
         """Masses, [particle_count], kg; a copy."""
         return self.model.particle_mass.numpy().copy()
+
+    @property
+    def _duration(self) -> float:
+        """Time from the first to the last frame, s."""
+        return self.scene.frame_count / self.scene.fps
 
     def prepare(self) -> None:
         """Compile and capture what frames need, so that the first one takes no longer than the others."""
@@ -168,12 +186,12 @@ class Simulator:
         if self._limits is None:
             if self.substep_count > 0:
                 raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
-            pairs = measure_pairs(self.model, self.state.x)
-            self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self.model))
+            pairs = bound_spring_pairs(self.model, self.state.x)
+            self._limits = step_limits(pairs), step_limits(add_contacts(pairs, contact_pairs(self.model)))
         return self._limits[contacts]
 
     def broken_limit(self) -> str | None:
-        """Say which limit the time step exceeds, with both numbers; None if it is within them."""
+        """Say which limit the time step exceeds, with both numbers; None if it is within all of them."""
         name = self.scene.solver.integrator
         for touching, where in ((False, "of the springs"), (True, "in contact with a collider")):
             limit = self.step_limits(contacts=touching)[name]
@@ -181,6 +199,18 @@ class Simulator:
                 return f"{name} has no stable step {where}, whatever solver.dt"
             if self.dt > limit:
                 return f"the time step of {self.dt:.4g} s is above the largest stable one {where}, {limit:.4g} s"
+        bounce = bounce_limits(contact_pairs(self.model))[name]
+        if bounce is not None and self.dt > bounce:
+            return (
+                f"with the time step of {self.dt:.4g} s bounces may gain energy: it is above {BOUNCE_SHARE:g} of what "
+                f"contact alone allows a particle; at most {bounce:.4g} s is safe"
+            )
+        magnetic = magnetic_limits(self.model, self._duration)[name]
+        if self.dt > magnetic:
+            return (
+                f"with the time step of {self.dt:.4g} s magnetic fields add more than {MAGNETIC_GAIN:.0%} of energy to "
+                f"what they turn; at most {magnetic:.4g} s is safe"
+            )
         return None
 
     def _largest_step(self) -> float:
@@ -196,7 +226,9 @@ class Simulator:
                 f'solver.dt = "auto": {solver.integrator} has no stable step for this scene, where something is '
                 f"undamped; integrators that have one: {others}"
             )
-        step = SAFETY[solver.integrator] * limit
+        bounce = bounce_limits(contact_pairs(self.model))[solver.integrator]
+        magnetic = magnetic_limits(self.model, self._duration)[solver.integrator]
+        step = min(SAFETY[solver.integrator] * limit, math.inf if bounce is None else bounce, magnetic)
         if self.scene.substeps_for(step) > MAX_SUBSTEPS:
             raise InputError(
                 f'solver.dt = "auto": a stable step of {step:.3g} s makes more than {MAX_SUBSTEPS} substeps a frame; '
@@ -209,12 +241,13 @@ class Simulator:
 
         Returns:
             ``kinetic``, ``elastic``, ``potential`` (of gravity, zero at the origin) and ``contact`` (in penetrated
-            colliders) energy, and what ``spring_losses`` (dampers), ``contact_losses`` (damping of contacts) and
-            ``friction_losses`` took since the start, J; together they keep their sum, to the order of the scheme;
+            colliders and overlapping particles) energy, and what ``spring_losses`` (dampers), ``contact_losses``
+            (damping of contacts) and ``friction_losses`` took since the start, J; together, less the ``field_work`` of
+            fields, they keep their sum, to the order of the scheme;
             ``momentum`` [3], kg m/s; ``angular_momentum`` [3] about the origin, kg m^2/s;
             ``max_speed``, m/s; ``penetrations`` [body_count], the greatest depth of a particle of each body in a
             collider, m; ``overlaps`` [body_count], that of its particles with others as balls, m; ``contacts``, the
-            number of particles in each collider summed.
+            number of particles in each collider summed, and of those that overlap others.
         """
         model, state = self.model, self.state
         self._elastic.zero_()
@@ -227,7 +260,9 @@ class Simulator:
         sums = self._measure_chunks()
         total, greatest = sums.sum(axis=0), sums.max(axis=0)
         contact_losses = state.contact_losses.numpy().sum(axis=1) + state.pair_losses.numpy().sum(axis=1)
-        pair_energy, overlaps = self._soft.measure() if self._soft is not None else (0.0, np.zeros(len(model.bodies)))
+        pair_energy, pair_contacts, overlaps = 0.0, 0, np.zeros(len(model.bodies))
+        if self._soft is not None:
+            pair_energy, pair_contacts, overlaps = self._soft.measure()
         penetrations = np.zeros(len(model.bodies))
         np.maximum.at(penetrations, model.chunk_body.numpy(), sums[:, diagnostics.DEPTH])
         return {
@@ -244,7 +279,7 @@ class Simulator:
             "max_speed": float(greatest[diagnostics.SPEED]),
             "penetrations": penetrations,
             "overlaps": overlaps,
-            "contacts": int(total[diagnostics.CONTACTS]),
+            "contacts": int(total[diagnostics.CONTACTS]) + pair_contacts,
         }
 
     def surfaces(self) -> list[SurfaceFrame]:

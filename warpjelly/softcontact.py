@@ -69,17 +69,22 @@ class SoftContact:
         if self._device.is_cpu:
             wp.capture_if(self._meetings, self._search, dt=dt, loss_weight=loss_weight)
         else:
-            # Conditional parts of CUDA graphs may not copy from memory of the host, as the build of a grid does.
+            # A GPU would have to wait for the host to hear of the meetings.
             self._search(dt=dt, loss_weight=loss_weight)
 
-    def measure(self) -> tuple[float, np.ndarray]:
-        """Return the energy stored in overlaps, J, and the greatest overlap of each body, float64 [body_count], m."""
+    def measure(self) -> tuple[float, int, np.ndarray]:
+        """Measure overlaps of particles.
+
+        Returns:
+            The energy stored in them, J; how many particles overlap others; the greatest overlap of each body, float64
+            [body_count], m.
+        """
         self._build_grid()
         inputs = [self._skin, wp.uint64(self._grid.id), self._points]
-        self._launch(pairs.measure_pairs, len(self._points), inputs, [self._energies, self._overlaps])
+        self._launch(pairs.measure_overlaps, len(self._points), inputs, [self._energies, self._overlaps])
         overlaps = np.zeros(len(self._model.bodies))
         np.maximum.at(overlaps, self._skin.body.numpy(), self._overlaps.numpy())
-        return float(self._energies.numpy().sum()), overlaps
+        return float(self._energies.numpy().sum()), int(np.count_nonzero(self._overlaps.numpy())), overlaps
 
     def _launch(self, kernel: wp.Kernel, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._device)

@@ -10,11 +10,15 @@ is exact; otherwise it is a bound. ARCHITECTURE.md has the formulas and what was
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import warp as wp
+
+from warpjelly.kernels import contacts, fields
 
 from .model import Model, launch_spring_forces
 
@@ -23,6 +27,12 @@ INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
 # semi-implicit Euler was seen to blow up at 0.7 of it under 30 % strain. Runge-Kutta 4 takes energy out of the fastest
 # motions, which leaves it more room.
 SAFETY = {"explicit_euler": 0.5, "semi_implicit_euler": 0.5, "rk2": 0.5, "rk4": 0.8}
+# Share of the largest stable step of a particle in contact alone up to which no bounce was seen to gain energy.
+BOUNCE_SHARE = 0.5
+# Share of its energy that a magnetic field may add to a particle by the error of a scheme.
+MAGNETIC_GAIN = 0.05
+# Of more colliders than this each is taken with all that meet it; of fewer, sets that all meet are sorted out.
+MAX_SORTED_OUT = 24
 # Stiffness that particles in contact add to each other, in that of one pair.
 SOFT_PARTNERS = 4.0
 # No limit above this is reported, s; no scene may ask for a longer step.
@@ -39,7 +49,7 @@ def step_limits(pairs: np.ndarray) -> dict[str, float | None]:
     """Return the largest stable step of each integrator, s; None where no step is stable.
 
     Args:
-        pairs: vertices of the set of (a, d), as from ``measure_pairs`` or ``add_contacts``, [vertex_count, 2].
+        pairs: vertices of the set of (a, d), as from ``bound_spring_pairs`` or ``add_contacts``, [vertex_count, 2].
     """
     a, d = pairs.T
     # The conditions of both Euler schemes are linear in (a, d): the vertices decide.
@@ -90,7 +100,7 @@ def _runge_kutta_limit(edges: np.ndarray, coefficients: tuple[float, ...]) -> fl
     return float(low.min())
 
 
-def measure_pairs(model: Model, x: wp.array) -> np.ndarray:
+def bound_spring_pairs(model: Model, x: wp.array) -> np.ndarray:
     """Return a convex polygon around the pairs (a, d) of the springs, [vertex_count, 2], 1/s^2 and 1/s.
 
     Args:
@@ -124,7 +134,7 @@ def measure_pairs(model: Model, x: wp.array) -> np.ndarray:
 
 
 def evaluations(model: Model) -> int:
-    """Return how many evaluations of the spring forces take about as long as ``measure_pairs``, vectors included."""
+    """Return how many evaluations of the spring forces take about as long as ``bound_spring_pairs``."""
     return 60 if _are_equal(_ratios(model)) else 1200
 
 
@@ -141,22 +151,118 @@ def _are_equal(ratios: np.ndarray) -> bool:
     return len(ratios) == 0 or bool(ratios.max() <= ratios.min() * (1.0 + 1e-6))
 
 
-def add_contacts(pairs: np.ndarray, model: Model) -> np.ndarray:
-    """Return a polygon around the pairs (a, d) of springs and of contact with any one collider or other particles.
+def contact_pairs(model: Model) -> np.ndarray:
+    """Return what contact adds to the pairs (a, d) of springs, [count, 2], no less than it does.
 
-    Each particle may touch, so this is a safe bound: the stiffness and the damping of a collider over the least mass
-    are added. Two colliders that one particle touches in one direction at once would add up; that is not covered.
-    Between particles it is four times their stiffness and damping: two facing balls make twice, and a ball in the gap
-    of four others about four times.
+    Each particle may touch, so this is a safe bound: of all sets of colliders whose insides meet, the greatest
+    stiffness and the greatest damping in any direction, over the least mass. Between particles it is four times their
+    stiffness and damping: two facing balls make twice, and a ball in the gap of four others about four times.
     """
-    added = np.stack([model.colliders.stiffness.numpy(), model.colliders.damping.numpy()], axis=1).astype(float)
+    table = model.colliders
+    stiffness, damping = table.stiffness.numpy().astype(float), table.damping.numpy().astype(float)
+    added = [
+        (_greatest_together(stiffness, table, members), _greatest_together(damping, table, members))
+        for members in _touched_together(table)
+    ]
     if model.skin is not None:
-        between = np.array([[model.skin.stiffness, model.skin.damping]])
-        added = np.concatenate([added.reshape(-1, 2), SOFT_PARTNERS * between])
-    if len(added) == 0:
-        return pairs
-    added *= float(model.particle_inv_mass.numpy().max())
-    return _hull(np.concatenate([pairs, *(pairs + pair for pair in added)]))
+        between = (SOFT_PARTNERS * model.skin.stiffness, SOFT_PARTNERS * model.skin.damping)
+        added += [between, *((a + between[0], d + between[1]) for a, d in added)]
+    return np.array(added, float).reshape(-1, 2) * float(model.particle_inv_mass.numpy().max())
+
+
+def add_contacts(pairs: np.ndarray, touching: np.ndarray) -> np.ndarray:
+    """Return a polygon around the pairs (a, d) of springs with and without contact, as from ``contact_pairs``."""
+    return _hull(np.concatenate([pairs, *(pairs + pair for pair in touching)])) if len(touching) else pairs
+
+
+def bounce_limits(touching: np.ndarray) -> dict[str, float | None]:
+    """Return the largest step of each integrator with which bounces do not gain energy, s; None where none is known.
+
+    It is a share of the largest stable step of a particle in contact without springs. ARCHITECTURE.md has the bounds.
+
+    Args:
+        touching: as from ``contact_pairs``.
+    """
+    limits = step_limits(add_contacts(np.zeros((1, 2)), touching))
+    return {name: None if limit is None else BOUNCE_SHARE * limit for name, limit in limits.items()}
+
+
+def magnetic_limits(model: Model, duration: float) -> dict[str, float]:
+    """Return the step of each integrator above which magnetic fields speed particles up, s.
+
+    A scheme takes y' = i w y, with w = |q B| / m, to R(i w dt) y: |R|^2 is 1 + (w dt)^2 for the Euler schemes, which
+    take v from the start of the step, and 1 + (w dt)^4 / 4 for RK2. The energy may grow by MAGNETIC_GAIN over the
+    duration [s]. RK4 takes energy out of it up to w dt = 2 sqrt(2).
+    """
+    table = model.fields
+    strength = np.linalg.norm(table.strength.numpy().astype(float), axis=1)
+    starts, factors = table.curve_start.numpy(), np.abs(table.curve_factor.numpy())
+    peak = [factors[i:j].max() if j > i else 1.0 for i, j in itertools.pairwise(starts)]
+    field = float((strength * peak)[table.kind.numpy() == fields.MAGNETIC].sum())
+    rates = np.abs(model.particle_charge.numpy().astype(float)) * model.particle_inv_mass.numpy()
+    if not (w := field * float(rates.max())):
+        return dict.fromkeys(INTEGRATORS, MAX_STEP)
+    gain = math.log1p(MAGNETIC_GAIN)
+    euler = gain / (w * w * duration)
+    rk2 = (4.0 * gain / (w**4 * duration)) ** (1.0 / 3.0)
+    steps = {"explicit_euler": euler, "semi_implicit_euler": euler, "rk2": rk2, "rk4": math.sqrt(8.0) / w}
+    return {name: min(step, MAX_STEP) for name, step in steps.items()}
+
+
+def _touched_together(table: Any) -> list[list[int]]:
+    """Return sets of colliders that one particle may be in at once: each such set is part of one of them."""
+    count = len(table.kind)
+    meets = np.zeros((count, count), bool)
+    for i in range(count):
+        for j in range(i):
+            meets[i, j] = meets[j, i] = _may_meet(table, i, j)
+    if count > MAX_SORTED_OUT:
+        return [[i, *np.flatnonzero(meets[i])] for i in range(count)]
+    found: list[list[int]] = []
+
+    def extend(members: list[int], candidates: set[int], excluded: set[int]) -> None:
+        """Bron and Kerbosch 1973, doi:10.1145/362342.362367, with a pivot."""
+        if not candidates and not excluded:
+            found.append(members)
+            return
+        pivot = max(candidates | excluded, key=lambda k: sum(meets[k, m] for m in candidates))
+        for k in [k for k in candidates if not meets[pivot, k]]:
+            near = set(np.flatnonzero(meets[k]).tolist())
+            extend([*members, k], candidates & near, excluded & near)
+            candidates = candidates - {k}
+            excluded = excluded | {k}
+
+    extend([], set(range(count)), set())
+    return found if count else []
+
+
+def _may_meet(table: Any, i: int, j: int) -> bool:
+    """Say whether a point may be inside two colliders; never wrongly no. Planes count as half-spaces."""
+    kinds, centers = table.kind.numpy(), table.center.numpy().astype(float)
+    radius, normals, sides = (
+        table.size.numpy()[:, 0].astype(float),
+        table.normal.numpy().astype(float),
+        table.side.numpy(),
+    )
+    offset = centers[i] - centers[j]
+    if kinds[i] == kinds[j] == contacts.SPHERE:
+        return bool(np.linalg.norm(offset) <= radius[i] + radius[j])
+    # For some body: a half-space keeps each on its own side.
+    if contacts.SPHERE in (kinds[i], kinds[j]):
+        sphere, flat = (i, j) if kinds[i] == contacts.SPHERE else (j, i)
+        height = (centers[sphere] - centers[flat]) @ normals[flat]
+        return bool((sides[flat] * height <= radius[sphere]).any())
+    facing = sides[i] * sides[j] * (normals[i] @ normals[j]) < -1.0 + 1e-6
+    return bool((~facing | (sides[i] * (offset @ normals[i]) >= 0.0)).any())
+
+
+def _greatest_together(constant: np.ndarray, table: Any, members: list[int]) -> float:
+    """Return the top eigenvalue of the sum of c n n^T over colliders; the normal of a sphere may be any."""
+    spheres = table.kind.numpy()[members] == contacts.SPHERE
+    flat = np.array(members)[~spheres]
+    normals = table.normal.numpy().astype(float)[flat]
+    top = np.linalg.eigvalsh((constant[flat, None] * normals).T @ normals)[-1] if len(flat) else 0.0
+    return float(top + constant[np.array(members)[spheres]].sum())
 
 
 def _clip(polygon: np.ndarray, normal: np.ndarray, reach: float) -> np.ndarray:
