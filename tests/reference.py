@@ -212,7 +212,7 @@ def grid_force(field: Any, points: np.ndarray) -> np.ndarray:
     nodes, lower, upper = field.nodes(), np.array(field.lower), np.array(field.upper)
     place = (np.clip(points, lower, upper) - lower) / (upper - lower) * (len(nodes) - 1)
     tents = np.maximum(0.0, 1.0 - np.abs(np.arange(len(nodes)) - place.T[:, :, None]))
-    force = np.einsum("ni,nj,nk,ijkc->nc", *tents, nodes, optimize=True)
+    force = np.tensordot(np.einsum("ni,nj,nk->nijk", *tents), nodes, 3)
     inside = ((lower <= points) & (points <= upper)).all(axis=1)
     return force if field.outside == "clamp" else force * inside[:, None]
 
@@ -306,6 +306,8 @@ class World:
         self.steps = 0
         self.losses = np.zeros(3)
         """Taken by springs, by the damping of contacts and by friction, J."""
+        self.field_work = 0.0
+        """Given by fields, J."""
         self.keys: list[list[Key]] = []
         xs, vs, ms, bodies, springs, self.starts = [], [], [], [], [], []
         first = 0
@@ -340,6 +342,7 @@ class World:
             bodies.append(np.full(len(x), number))
             first += len(x)
         self.x, self.v, self.m, self.body = (np.concatenate(parts) for parts in (xs, vs, ms, bodies))
+        self.charge = np.array([scene.bodies[body].charge for body in self.body])
         table = np.array(springs)
         self.ends = table[:, :2].astype(int)
         self.rest, self.k, self.d = table[:, 2:].T.copy()
@@ -367,22 +370,25 @@ class World:
     def evaluate(
         self, x: np.ndarray, v: np.ndarray, touches: list[list[Touch]], share: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return the total forces, a share of a step on, and what springs, contacts and friction take out, W [3]."""
+        """Return the total forces [count, 3], a share of a step on, and the powers [4], W.
+
+        Those are what springs, contacts and friction take and what fields give.
+        """
         elastic = spring_forces(x, v, self.ends, self.rest, self.k, 0 * self.d)
         springs = spring_forces(x, v, self.ends, self.rest, self.k, self.d)
         applied = self.m[:, None] * self.scene.gravity_vector + springs
-        charge = np.array([self.scene.bodies[body].charge for body in self.body])
+        pushed = np.zeros_like(x)
         for field in self.scene.fields:
-            applied = applied + field_force(field, x, v, charge, (self.steps + share) * self.dt)
-        given = np.zeros_like(x)
-        total, power = applied, np.array([-((springs - elastic) * v).sum(), 0.0, 0.0])
+            pushed += field_force(field, x, v, self.charge, (self.steps + share) * self.dt)
+        applied, given = applied + pushed, np.zeros_like(x)
+        total, power = applied, np.array([-((springs - elastic) * v).sum(), 0.0, 0.0, (pushed * v).sum()])
         for law, of_collider in zip(self.laws, touches, strict=True):
             for touch in of_collider:
                 if touch.here.any():
                     reaction, friction = contact_forces(law, touch, v, applied, self.m, self.dt, given)
                     stored = law["stiffness"] * np.where(touch.here, touch.counted, 0.0)[:, None] * touch.normal
                     total, given = total + reaction + friction, given + friction
-                    power -= [0.0, ((reaction - stored) * v).sum(), (friction * v).sum()]
+                    power -= [0.0, ((reaction - stored) * v).sum(), (friction * v).sum(), 0.0]
         return total, power
 
     def forces(self) -> np.ndarray:
@@ -423,7 +429,8 @@ class World:
                 self.x = x + h / 6 * (v + 2 * u2 + 2 * u3 + u4)
                 self.v = v + h / 6 * (a + 2 * a2 + 2 * a3 + a4)
                 power = (power + 2 * power2 + 2 * power3 + power4) / 6
-        self.losses += h * power
+        self.losses += h * power[:3]
+        self.field_work += h * power[3]
         self.before, self.touches = x, now
         self.steps += 1
 

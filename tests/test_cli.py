@@ -2,6 +2,7 @@ import csv
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -237,11 +238,14 @@ def test_an_interrupted_run_keeps_its_frames(warpjelly, tmp_path, monkeypatch):
         (["run", CUBE, "--set", "bodies.cube.velocity=[0.0, -1e12, 0.0]"], "bodies.0.velocity.1"),
         (["run", CUBE, "--set", "gravity=[0.0, -1e12, 0.0]"], "gravity.1"),
         (["run", CUBE, "--set", "fps=" + 5000 * "9"], "fps"),
+        (["run", CUBE, "--set", "fps=" + 3000 * "["], "fps"),
+        (["run", CUBE, "--set", "bodies.².size=3"], "no entry '²'"),
         (["fly"], "fly"),
         (["validate", "none.usdc"], "none.usdc"),
         (["preview", "none.usdc", "-o", "a.png"], "none.usdc"),
         (["preview", "none.usdc"], "output"),
         (["preview", "none.usdc", "-o", "a.png", "--size", "big"], "--size big"),
+        (["preview", "none.usdc", "-o", "a.png", "--size", "²x3"], "--size ²x3"),
     ],
 )
 def test_wrong_arguments_exit_with_2_and_one_line(warpjelly, tmp_path, monkeypatch, arguments, said):
@@ -288,10 +292,37 @@ def test_a_scene_that_cannot_fit_is_refused_with_the_numbers(warpjelly, tmp_path
     code, _, err = warpjelly("check", CUBE, "--set", "bodies.cube.particles_per_edge=300")
     assert code == 2
     assert "27,000,000 particles" in err
-    assert "of 1.0 GB" in one_line(err)
+    assert one_line(err).startswith(f"error: {CUBE}: 27,000,000 particles")
+    assert "of 1.0 GB" in err
     code, _, err = warpjelly("check", SCENES / "tree_drop.toml", "--set", "bodies.tree.resolution=4096")
     assert code == 2
     assert "a grid of" in one_line(err)
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("bodies.cube.pinned=[{indices=[2000]}]", "bodies.cube.pinned.0.indices: no particle 2000"),
+        ("bodies.cube.particles_per_edge=4096", "particles are more than"),
+        (
+            "bodies.cube={name='cube', type='model', material='jelly', file='a.xyz', resolution=3}",
+            "a.xyz: unknown mesh",
+        ),
+    ],
+)
+def test_a_scene_that_cannot_be_built_is_named(warpjelly, tmp_path, setting, said):
+    """Name the scene file before what is wrong, in every command, and not before what is wrong elsewhere."""
+    scene = tmp_path / "scene.toml"
+    shutil.copy(CUBE, scene)
+    (tmp_path / "a.xyz").write_text("0 0 0")
+    for command in (["run"], ["check"], ["export-world", "-o", tmp_path / "a.w", "--force"]):
+        code, _, err = warpjelly(command[0], scene, *command[1:], "--set", setting)
+        assert code == 2
+        assert one_line(err).startswith(f"error: {scene}: ")
+        assert one_line(err).count(str(scene)) == 1
+        assert said in err or command[0] == "export-world"
+    code, _, err = warpjelly("check", scene, "--device", "cuda:9")
+    assert (code, str(scene) in one_line(err)) == (2, False)
 
 
 @pytest.mark.parametrize("output", ["file", "file/below"])

@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import math
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -9,7 +14,7 @@ import pytest
 import reference
 import warp as wp
 from reference import EPSILON, ROUND_OFF, World
-from worlds import make_scene, set_state, step_of, substeps_of
+from worlds import make_material, make_scene, set_state, step_of, substeps_of
 
 from warpjelly.errors import InputError
 from warpjelly.kernels import fields
@@ -159,6 +164,65 @@ def test_a_bad_field_is_refused(tmp_path, changes: dict[str, Any], said: str) ->
     assert "fields.0" in str(caught.value)
 
 
+def save_damaged(path: Path) -> None:
+    """Write a .npz file in whose packed data some bytes are wrong."""
+    np.savez_compressed(path, np.random.default_rng(1).normal(size=(8, 3)))
+    data = bytearray(path.read_bytes())
+    data[60:100] = 40 * b"\xff"
+    path.write_bytes(data)
+
+
+def save_header(old: bytes, new: bytes) -> Callable[[Path], None]:
+    """Return what writes a .npy file with a changed header, padded to the length that it had."""
+
+    def save(path: Path) -> None:
+        packed = io.BytesIO()
+        np.save(packed, np.zeros((8, 3)))
+        data = packed.getvalue()
+        assert old in data
+        path.write_bytes(data.replace(old, new).replace(b" " * (len(new) - len(old)) + b"\n", b"\n", 1))
+
+    return save
+
+
+def save_text(path: Path) -> None:
+    """Write a .npz file that holds a text."""
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("readme.txt", "forces")
+
+
+@pytest.mark.parametrize(
+    ("name", "save", "said"),
+    [
+        ("damaged.npz", save_damaged, "decompressing"),
+        ("text.npz", save_text, "something else"),
+        ("header.npy", save_header(b"'descr'", b"'descr\""), "header"),
+        ("open.npy", save_header(b"'shape': (8, 3), }", b"'shape': (8, 3, 0 "), ""),
+        ("huge.npy", save_header(b"(8, 3)", b"(1000000, 1000000, 1000)"), "allocate"),
+        ("fields.npy", lambda path: np.save(path, np.zeros(8, [("x", float), ("y", float), ("z", float)])), "'x'"),
+        ("complex.npy", lambda path: np.save(path, np.zeros((8, 3), complex)), "complex128"),
+        ("dates.npy", lambda path: np.save(path, np.zeros((8, 3), "datetime64[s]")), "datetime64"),
+        ("words.npy", lambda path: np.save(path, np.full((8, 3), "1.0")), "<U3"),
+        ("flags.npz", lambda path: np.savez(path, np.zeros((8, 3), bool)), "bool"),
+    ],
+)
+def test_a_file_without_an_array_of_numbers_is_refused(
+    tmp_path: Path, name: str, save: Callable[[Path], None], said: str
+) -> None:
+    """Name the file and what is wrong in one line, whatever reading it trips over."""
+    save(tmp_path / name)
+    (tmp_path / "scene.toml").write_text(
+        '[materials.m]\n[[bodies]]\ntype = "cube"\nmaterial = "m"\n[[fields]]\ntype = "grid"\n'
+        f'lower = [-1.0, -1.0, -1.0]\nupper = [1.0, 1.0, 1.0]\nfile = "{name}"\n'
+    )
+    with pytest.raises(InputError) as caught:
+        load_scene(tmp_path / "scene.toml")
+    message = str(caught.value)
+    assert f"fields.0: {tmp_path / name}: not a NumPy file with one array of numbers: " in message
+    assert said in message.split("numbers: ")[1]
+    assert "\n" not in message
+
+
 def make_charged(precision: str, fields: list[dict[str, Any]]) -> Any:
     """Return a scene of a charged cube of 8 particles that moves without turning."""
     body = {"type": "cube", "material": "jelly", "particles_per_edge": 2, "charge": 0.02, "velocity": [1.0, 0.5, 0.25]}
@@ -275,3 +339,78 @@ def test_a_cube_in_all_fields_moves_like_the_reference(device: str) -> None:
     # 300 steps of errors of a few ROUND_OFF, which springs of w dt < 1 do not amplify beyond their number.
     np.testing.assert_allclose(sim.positions, world.x, rtol=0, atol=300 * 10 * ROUND_OFF["float64"])
     np.testing.assert_allclose(sim.velocities, world.v, rtol=0, atol=300 * 1e3 * ROUND_OFF["float64"])
+
+
+ORDERS = {"explicit_euler": 1, "semi_implicit_euler": 1, "rk2": 2, "rk4": 4}
+LOOSE = make_material(0.0, 0.0)
+"""Springs without force: particles that move alike stay together without them."""
+
+
+@pytest.mark.parametrize("integrator", ORDERS)
+def test_a_ramp_accelerates_by_the_sum_of_the_scheme(integrator: str, precision: str, device: str) -> None:
+    """Push with a force that grows linearly, a = a0 + b t: each scheme makes a polynomial of it.
+
+    With C(n, k) = n! / (k! (n - k)!) and T = n dt, v is v0 + a0 T + b V and x is x0 + v0 T + a0 P + b Q, where
+
+    explicit Euler: V = C(n, 2) dt^2, P = C(n, 2) dt^2, Q = C(n, 3) dt^3;
+    semi-implicit Euler: V = C(n, 2) dt^2, P = C(n + 1, 2) dt^2, Q = C(n + 1, 3) dt^3, the same but with new velocities;
+    RK2: V = T^2/2 and P = T^2/2 exactly; x gains v dt + a dt^2/2 in a step, a at its start: Q = T^3/6 - T dt^2/6;
+    RK4: V, P and Q = T^3/6 exactly, which needs forces at the start, in the middle and at the end of a step.
+    """
+    start, slope, n, mass = 0.25, 10.0, 500, 0.01
+    force, velocity = np.array([0.04, -0.03, 0.02]), np.array([-1.0, 0.5, 0.25])
+    curve = [[0.0, start], [2.0, start + 2.0 * slope]]
+    body = {"type": "cube", "material": "jelly", "particles_per_edge": 2, "velocity": velocity.tolist()}
+    field = {"type": "constant", "force": force.tolist(), "curve": curve}
+    scene = make_scene(
+        bodies=[body], fields=[field], materials={"jelly": LOOSE | {"particle_mass": mass}},
+        solver={"precision": precision, "integrator": integrator},
+    )  # fmt: skip
+    sim, dt = Simulator(scene, device=device), step_of(scene)
+    x0, a0, b, t = sim.positions.astype(float), start * force / mass, slope * force / mass, n * dt
+    sim.step(n)
+    late, p, q = {
+        "explicit_euler": (math.comb(n, 2) * dt**2, math.comb(n, 2) * dt**2, math.comb(n, 3) * dt**3),
+        "semi_implicit_euler": (math.comb(n, 2) * dt**2, math.comb(n + 1, 2) * dt**2, math.comb(n + 1, 3) * dt**3),
+        "rk2": (t**2 / 2, t**2 / 2, t**3 / 6 - t * dt**2 / 6),
+        "rk4": (t**2 / 2, t**2 / 2, t**3 / 6),
+    }[integrator]
+    # As in free fall: half an epsilon of up to 2 m, and of up to 8 m/s for n dt, per step, or twice that with stages.
+    bound = 2 * EPSILON[precision] * n
+    np.testing.assert_allclose(sim.velocities, np.tile(velocity + a0 * t + b * late, (8, 1)), rtol=0, atol=8 * bound)
+    expected = x0 + velocity * t + a0 * p + b * q
+    np.testing.assert_allclose(sim.positions, expected, rtol=0, atol=(2 + 8 * t) * bound)
+    # Forces half a step too early or too late would change the velocities by b dt/2 T.
+    assert np.abs(b).max() * dt * t / 2 > 5 * 8 * bound
+    # What RK2 lacks is seen in float64.
+    assert precision == "float32" or np.abs(b).max() * t * dt**2 / 6 > 1e3 * (2 + 8 * t) * bound
+
+
+@pytest.mark.parametrize("integrator", ORDERS)
+def test_motion_in_a_changing_field_converges_with_the_order_of_the_scheme(integrator: str, device: str) -> None:
+    """Come closer to the motion of a charge in a magnetic field that changes by 2^order when the step is halved.
+
+    With u = vx + i vy, u' = -i w f(t) u, so u(t) = u(0) exp(-i w F(t)), F the integral of the curve f. Keyframes are at
+    ends of steps, so that f is smooth within each. Forces at other times than those of the stages are of first order.
+    """
+    charge, mass, b, end = 0.02, 0.01, 4.0, 0.4
+    curve = [[0.0, 0.5], [end / 2, 2.0], [end, -1.0]]
+    errors = []
+    # Errors are c dt^p (1 + O(w dt)), with w f dt at most 0.002 for Euler, 0.04 for RK2 and 0.16 for RK4.
+    for dt in np.array([1.0, 0.5]) * {"rk2": 2.5e-3, "rk4": 1e-2}.get(integrator, 1.25e-4):
+        body = {"type": "cube", "material": "jelly", "particles_per_edge": 2, "charge": charge,
+                "velocity": [1.0, 0.5, 0.25]}  # fmt: skip
+        field = {"type": "magnetic", "strength": [0.0, 0.0, b], "curve": curve}
+        scene = make_scene(
+            bodies=[body], fields=[field], materials={"jelly": LOOSE | {"particle_mass": mass}},
+            solver={"dt": dt, "integrator": integrator},
+        )  # fmt: skip
+        sim = Simulator(scene, device=device)
+        assert sim.dt == pytest.approx(dt, rel=1e-12)
+        sim.step(round(end / dt))
+        turned = charge * b / mass * np.trapezoid(*zip(*[(f, t) for t, f in curve], strict=True))
+        u = (1.0 + 0.5j) * np.exp(-1j * turned)
+        errors.append(np.abs(sim.velocities - [u.real, u.imag, 0.25]).max())
+    assert math.log2(errors[0] / errors[1]) == pytest.approx(ORDERS[integrator], abs=0.1)
+    # Far above round-off, some epsilon for each step.
+    assert errors[1] > 1e5 * EPSILON["float64"]

@@ -92,22 +92,44 @@ def test_free_fall_follows_the_sum_of_each_scheme(integrator: str, precision: st
     np.testing.assert_allclose(simulator.velocities, after, rtol=0, atol=2 * EPSILON[precision] * n * 8)
 
 
-def make_rough_world(seed: int, **solver: Any) -> Scene:
-    """Return a random world with friction and a ball that pushes back to where one came in; bodies fall fast."""
+def draw_fields(rng: np.random.Generator) -> list[dict[str, Any]]:
+    """Return a field of each kind, with curves that turn between and on steps, in binary fractions."""
+
+    def draw(size: float, *shape: int) -> Any:
+        return (np.round(rng.uniform(-size, size, shape) * 64) / 64).tolist()
+
+    # Weights are some 0.1 N, charges 0.25 and -0.125 C, speeds 4 m/s: every field pushes by up to as much.
+    curve = [[0.0, 0.5], [0.0625, 1.0], [0.110, -1.0], [0.1875, 1.5]]
+    return [
+        {"type": "constant", "force": draw(0.125, 3), "curve": curve},
+        {"type": "grid", "lower": [-1.0, -0.25, -0.5], "upper": [0.75, 0.875, 0.5], "forces": draw(0.25, 3, 3, 3, 3),
+         "outside": "zero", "curve": curve[::2]},
+        {"type": "electric", "strength": draw(1.0, 3), "curve": curve[1:]},
+        {"type": "magnetic", "strength": draw(0.5, 3), "curve": curve},
+    ]  # fmt: skip
+
+
+def make_rough_world(seed: int, *, without: int | None = None, **solver: Any) -> Scene:
+    """Return a random world with friction and a ball that pushes back to where one came in; bodies fall fast.
+
+    They are charged, and there is a field of each kind, but for one that is left out.
+    """
     world = make_random_world(seed)
     rng = np.random.default_rng(100 + seed)
     for collider in world["colliders"]:
         collider |= {"static_friction": 0.5, "dynamic_friction": 0.375}
     world["colliders"][2]["normal"] = "entry"
-    for body in world["bodies"]:
+    for body, charge in zip(world["bodies"], (0.25, -0.125), strict=True):
         body["velocity"] = (np.round(rng.uniform([-2, -3.5, -2], [2, -2.5, 2]) * 64) / 64).tolist()
-    return make_scene(**world, solver={"dt": 2.5e-4, **solver})
+        body["charge"] = charge
+    fields = [field for number, field in enumerate(draw_fields(rng)) if number != without]
+    return make_scene(**world, fields=fields, solver={"dt": 2.5e-4, **solver})
 
 
 @pytest.mark.parametrize("integrator", ORDERS)
 @pytest.mark.parametrize("seed", [1, 8])
 def test_trajectories_match_the_reference(seed: int, integrator: str, device: str) -> None:
-    """Follow random small worlds with friction on all colliders for 1000 steps like the reference, losses included."""
+    """Follow random small worlds of fields and rough colliders for 1000 steps like the reference, losses included."""
     scene = make_rough_world(seed, integrator=integrator)
     simulator, world = Simulator(scene, device=device), World(scene)
     touched = np.zeros(len(scene.colliders), int)
@@ -121,11 +143,23 @@ def test_trajectories_match_the_reference(seed: int, integrator: str, device: st
         measured = simulator.diagnostics()
         losses = [measured[name] for name in ENERGIES[4:]]
         np.testing.assert_allclose(losses, world.losses, rtol=1e-9, atol=1e-9)
+        assert measured["field_work"] == pytest.approx(world.field_work, rel=1e-9, abs=1e-9)
         assert world.touches is not None
         touched += [sum(int(touch.here.sum()) for touch in touches) for touches in world.touches]
     # Every collider took part, and every way to lose energy.
     assert (touched > 0).all()
     assert (world.losses > 0.01).all()
+
+
+@pytest.mark.parametrize("seed", [1, 8])
+def test_every_field_matters_to_the_trajectories(seed: int) -> None:
+    """End the 1000 steps elsewhere by more than 1 mm, a million times what is allowed above, without any one field."""
+    places = []
+    for without in (None, *range(4)):
+        simulator = Simulator(make_rough_world(seed, without=without), device="cpu")
+        simulator.step(1000)
+        places.append(simulator.positions)
+    assert (np.abs(np.array(places[1:]) - places[0]).max(axis=(1, 2)) > 1e-3).all()
 
 
 def drop(integrator: str, dt: float, device: str) -> tuple[np.ndarray, float]:

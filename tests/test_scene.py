@@ -36,6 +36,14 @@ def scene_file(tmp_path):
     return write
 
 
+def nested(depth: int) -> dict:
+    """Return tables in tables."""
+    table: dict = {}
+    for _ in range(depth):
+        table = {"a": table}
+    return table
+
+
 def refusal(path: Path, **options) -> str:
     """Return the message with which a scene is refused."""
     with pytest.raises(InputError) as caught:
@@ -64,6 +72,13 @@ def test_defaults_are_filled_in(scene_file):
         ({"solver.dt": math.nan}, ["solver.dt", "finite"]),
         ({"solver.dt": "fast"}, ['solver.dt = "fast"', "number"]),
         ({"solver.dt": True}, ["solver.dt = true", "number"]),
+        ({"solver.dt": 10**400, "solver.steps_per_frame": 2}, ["solver.dt = 1000", "number"]),
+        ({"solver.dt": 1e-320, "solver.steps_per_frame": 2}, ["solver.dt = 1e-320", "greater than"]),
+        ({"solver.steps_per_frame": 10**400}, ["solver.steps_per_frame = 1000", "less than or equal to 1000000"]),
+        # More digits than Python writes, more levels than it follows.
+        ({"fps": 16**6000}, ["fps = ...", "number"]),
+        ({"fps": nested(3000)}, ["fps", "number"]),
+        ({"gravity": nested(3000)}, ["gravity", "list of numbers"]),
         ({"solver.precision": "half"}, ['solver.precision = "half"', "float32"]),
         ({"solver.stepp": 1}, ["solver.stepp", "unknown key", "integrator, dt, precision, culling"]),
         ({"solver.presision": 1}, ["solver.presision", "did you mean 'precision'"]),
@@ -144,7 +159,7 @@ def test_a_grid_has_its_axes_where_the_documentation_says():
     assert {tuple(int(i) for i in cell) for cell in np.argwhere(body.grid())} == {(0, 0, 0), (2, 1, 1)}
 
 
-@pytest.mark.parametrize("text", ["a = [", "a = 1\na = 2", "= 3"])
+@pytest.mark.parametrize("text", ["a = [", "a = 1\na = 2", "= 3", "a = " + 3000 * "[" + 3000 * "]"])
 def test_a_file_that_is_not_toml_is_refused(scene_file, text):
     """Name the file and the line where TOML cannot be parsed."""
     assert "not valid TOML" in refusal(scene_file(text))
@@ -170,6 +185,8 @@ def test_a_missing_model_is_refused_by_its_full_path(scene_file):
     ("key", "said"),
     [
         ("bodies.3.size", "no entry '3'"),
+        ("bodies.².size", "no entry '²'"),
+        ("bodies." + 5000 * "1" + ".size", "no entry '111"),
         ("bodies.dog.size", "entries: 0 to 0"),
         ("solver.dt.x", "not a table"),
         ("nonsense.key", "nonsense"),

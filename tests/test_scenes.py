@@ -14,14 +14,18 @@ KINDS = ("structural", "shear", "bend")
 NO_SPRING = {"stiffness": 0.0, "damping": 0.0}
 SOFT_SPRING = {"stiffness": 1.0, "damping": 0.1}
 
+# The scene whose room is there to be seen.
+NEVER_TOUCHED = "force_grid"
+
 # What each scene shows, switched off, and the expectation that has to notice.
 SWITCHED_OFF = [
     ("broken_damping", {f"materials.jelly.{kind}.damping": 0.05 for kind in KINDS}, "diverges"),
-    ("broken_springs", {f"materials.jelly.{kind}.stiffness": 30.0 for kind in KINDS}, "shape_error"),
+    ("broken_springs", {f"materials.jelly.{kind}.stiffness": 3.0 for kind in KINDS}, "rest_height"),
+    ("broken_springs", {f"materials.jelly.{kind}.stiffness": 3.0 for kind in KINDS}, "shape_error"),
     ("chain", {"bodies.chain.pinned": []}, "reach"),
     ("corner_throw", {"colliders": []}, "reach"),
     ("falling_cloth", {"soft_contact.mode": "off"}, "rest_height"),
-    ("force_grid", {"fields": []}, "reach"),
+    ("force_grid", {"fields": []}, "rotation"),
     ("hanging_cloth", {"bodies.cloth.pinned": []}, "rest_height"),
     ("hanging_cloth", {"materials.cloth.shear": NO_SPRING}, "rest_height"),
     ("hanging_cloth", {"materials.cloth.shear": NO_SPRING}, "shape_error"),
@@ -42,7 +46,7 @@ SWITCHED_OFF = [
     ),
     ("soft_plane", {"colliders.floor.stiffness": 2000.0}, "rest_height"),
     ("stiff_plane", {"colliders.floor.stiffness": 2000.0}, "bounce"),
-    ("stiff_plane", {"solver.dt": 5e-4}, "bounce"),
+    ("stiff_plane", {"solver.dt": 1e-4}, "bounce"),
     ("three_networks", {"materials.structural_only.shear": SOFT_SPRING}, "shape_error"),
     ("three_networks", {"materials.with_shear.shear": NO_SPRING}, "shape_error"),
     ("three_networks", {"materials.with_shear.bend": SOFT_SPRING}, "shape_error"),
@@ -118,10 +122,11 @@ def test_culling_changes_no_bit_of_a_scene(name):
         for simulator in (culled, full):
             simulator.step(simulator.substeps)
         contacts += full.diagnostics()["contacts"]
-        for quantity in ("x", "v", "f", "stamps", "normals", "contact_losses"):
+        for quantity in ("x", "v", "f", "stamps", "normals", "contact_losses", "pair_losses"):
             bits = [getattr(simulator.state, quantity).numpy().tobytes() for simulator in (culled, full)]
             assert bits[0] == bits[1], (quantity, full.time)
         if full.first_lost() is not None:
             break
     # What diverges may burst before it touches anything.
-    assert contacts > 0 or not full.scene.colliders or full.first_lost() is not None
+    touches = bool(full.scene.colliders) and name != NEVER_TOUCHED
+    assert (contacts > 0) == touches or full.first_lost() is not None or full.scene.soft_contacts

@@ -17,7 +17,7 @@ from test_scenes import NAMES, SCENES
 from worlds import make_material, make_scene, set_state
 
 from warpjelly import stability
-from warpjelly.errors import DivergedError, InputError
+from warpjelly.errors import DivergedError, SceneError
 from warpjelly.run import forecast, simulate
 from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
@@ -365,6 +365,117 @@ def test_magnetic_fields_have_limits() -> None:
         assert auto.dt <= limit
 
 
+# What balls do to each other here. Explicit Euler and RK2 have no limit without damping.
+BETWEEN = {"stiffness": 1000.0, "damping": 0.8, "friction": 0.0}
+
+
+def make_squeezed(dt: float = 1e-3, integrator: str = "semi_implicit_euler") -> Scene:
+    """Return a scene of a ball of 10 g in the gaps of four others on either side, which are pinned.
+
+    Centres are 1 m apart, the balls a little larger. With normals (+-1/2, +-1/2^0.5, +-1/2) the stiffness is
+    k sum n n^T = k diag(2, 4, 2), less a share of the order of overlap / distance, 0.001. The same is what two layers
+    of balls, each in the gap of four of the other layer, make when they swing against each other: four times c^2 = 1/2
+    for each ball, twice over for the relative motion.
+    """
+    around = [[x, y, z] for x in (-0.5, 0.5) for y in (-(0.5**0.5), 0.5**0.5) for z in (-0.5, 0.5)]
+    bodies = [
+        {"name": "around", "type": "network", "material": "loose", "points": around,
+         "pinned": [{"lower": [-1.0] * 3, "upper": [1.0] * 3}]},
+        {"name": "within", "type": "network", "material": "loose", "points": [[0.0, 0.0, 0.0]]},
+    ]  # fmt: skip
+    return make_scene(
+        bodies=bodies, materials={"loose": make_material(0.0, 0.0, particle_mass=0.01)},
+        soft_contact=BETWEEN | {"radius": 0.5005},
+        solver={"dt": dt, "integrator": integrator, "steps_per_frame": 20}, fps=0.05 / dt,
+    )  # fmt: skip
+
+
+def growth_between(integrator: str, dt: float) -> float:
+    """Return by how much the energy of a squeezed ball grows at most over 4000 steps."""
+    simulator = Simulator(make_squeezed(dt, integrator), device="cpu")
+    assert simulator.dt == dt
+    x, v, rng = simulator.positions, simulator.velocities, np.random.default_rng(7)
+    # A millionth of the overlap: a thousand times that is still small. Positions in units of velocity.
+    w = np.sqrt(np.array([2.0, 4.0, 2.0]) * BETWEEN["stiffness"] / 0.01)
+    x[8], v[8] = 1e-9 * rng.standard_normal((2, 3)) * [np.ones(3), w]
+    set_state(simulator, x=x, v=v)
+    first, greatest = ((w * x[8]) ** 2 + v[8] ** 2).sum(), 0.0
+    for _ in range(200):
+        simulator.advance_frame()
+        greatest = max(greatest, ((w * simulator.positions[8]) ** 2 + simulator.velocities[8] ** 2).sum() / first)
+        if not greatest < 1e6:
+            break
+    return greatest
+
+
+@pytest.mark.parametrize("integrator", INTEGRATORS)
+def test_a_ball_between_others_obeys_the_limit(integrator: str) -> None:
+    """Keep a squeezed ball where it is at 0.95 of the limit in contact, and throw it out at 1.05 of it."""
+    simulator = Simulator(make_squeezed(), device="cpu")
+    assert simulator.step_limits(contacts=False) == dict.fromkeys(INTEGRATORS, stability.MAX_STEP)
+    limit = simulator.step_limits(contacts=True)[integrator]
+    # That of four times stiffness and damping on 0.01 kg.
+    a, d = (4.0 * BETWEEN[name] / 0.01 for name in ("stiffness", "damping"))
+    assert limit is not None
+    assert limit == pytest.approx(stability.step_limits(np.array([[0.0, 0.0], [a, d]]))[integrator], rel=1e-6)
+    # Semi-implicit Euler lets energy grow by 4 / (1 - share) at most (see the scenes below). The others have the modes
+    # of the exact flow, which mix position and velocity by (1 + z) / (1 - z), z = d / (2 a^0.5) = 0.25.
+    assert growth_between(integrator, 0.95 * limit) <= 80
+    assert not growth_between(integrator, 1.05 * limit) < 1e6
+
+
+def make_pressed(dt: float) -> Scene:
+    """Return a scene of two soft cubes that are pressed together, the balls of one in the gaps of the other."""
+    count, unit = 5, 0.25
+    # Balls of 0.125 m touch at a height of 2^0.5 times that above gaps; these overlap by 0.1 mm.
+    apart = np.array([unit / 2.0, 1.0 + 0.5**0.5 * unit - 1e-4, unit / 2.0])
+    bodies = [
+        {"name": name, "type": "cube", "material": "jelly", "particles_per_edge": count, "charge": -0.1 * side,
+         "position": (side * apart / 2.0).tolist()}
+        for name, side in (("upper", 1.0), ("lower", -1.0))
+    ]  # fmt: skip
+    return make_scene(
+        bodies=bodies, materials={"jelly": make_material(20.0, 0.02, particle_mass=0.01)},
+        fields=[{"type": "electric", "strength": [0.0, 1.0, 0.0]}],
+        soft_contact={"stiffness": 1e4, "damping": 0.5, "friction": 0.0},
+        solver={"dt": dt, "steps_per_frame": 20}, fps=0.05 / dt,
+    )  # fmt: skip
+
+
+def pressed_energy(dt: float) -> float:
+    """Return the energy of pressed cubes over 0.5 s as a share of what there can be, at most."""
+    simulator = Simulator(make_pressed(dt), device="cpu")
+    names, given, greatest, contacts = ("kinetic", "elastic", "contact"), 0.0, 0.0, 0
+    start = simulator.diagnostics()
+    first = sum(start[name] for name in names)
+    while simulator.time < 0.5:
+        try:
+            simulator.advance_frame()
+        except DivergedError:
+            return math.inf
+        now = simulator.diagnostics()
+        given = max(given, now["field_work"])
+        greatest = max(greatest, sum(now[name] for name in names) / (first + given))
+        contacts += now["contact"] > 0.0
+    assert contacts > 10 or not greatest < 80
+    return greatest
+
+
+def test_pressed_cubes_need_the_limit_of_their_contact() -> None:
+    """Stay bounded at 0.95 of the limit with contact, which is lower than that of the springs, where they blow up."""
+    simulator = Simulator(make_pressed(1e-4), device="cpu")
+    springs, limit = (simulator.step_limits(contacts=flag)["semi_implicit_euler"] for flag in (False, True))
+    assert springs is not None
+    assert limit is not None
+    # (a, d) of the top motion of the springs plus four times those of a pair; z^2 - (2 - d dt - a dt^2) z + 1 - d dt
+    # has the root -1 at 4 - 2 d dt - a dt^2 = 0.
+    a, d = stability.bound_spring_pairs(simulator.model, simulator.state.x)[1] + 4.0 * np.array([1e4, 0.5]) / 0.01
+    assert limit == pytest.approx((math.sqrt(d * d + 4.0 * a) - d) / a, rel=1e-6)
+    assert limit < 0.2 * springs
+    assert pressed_energy(0.95 * limit) <= 80
+    assert pressed_energy(0.95 * springs) > 80
+
+
 def test_pinned_particles_do_not_move() -> None:
     """Leave particles of zero inverse mass out: a body held at one end is not less stable than a free one."""
     simulator = Simulator(make_cube(4, ALL_LIMITED), device="cpu")
@@ -401,7 +512,7 @@ def test_auto_names_the_integrators_that_would_do(monkeypatch: pytest.MonkeyPatc
         return dict.fromkeys(INTEGRATORS, None) | {"rk4": 1e-3}
 
     monkeypatch.setattr("warpjelly.simulator.step_limits", without)
-    with pytest.raises(InputError, match=r'solver.dt = "auto".*semi_implicit_euler.*rk4'):
+    with pytest.raises(SceneError, match=r'solver.dt = "auto".*semi_implicit_euler.*rk4'):
         Simulator(make_cube(2, UNDAMPED, solver={"dt": "auto"}), device="cpu")
 
 

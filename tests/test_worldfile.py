@@ -13,7 +13,7 @@ from reference import ROUND_OFF, World
 from world_files import INDICES, WORLDS, WorldFile, sample_field
 from worlds import step_of, substeps_of
 
-from warpjelly.errors import InputError
+from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
 from warpjelly.simulator import Simulator
@@ -312,6 +312,9 @@ force = [0.25, 0.0, 0.0]
 """
 
 
+EMPTY_GRID = {"type": "grid", "lower": [-2.0] * 3, "upper": [2.0] * 3}
+
+
 def test_a_scene_that_fits_becomes_a_world(tmp_path: Path, device: str) -> None:
     """Start a scene and its world from the same places, speeds and forces."""
     path = tmp_path / "a.toml"
@@ -342,6 +345,8 @@ def test_a_scene_that_fits_becomes_a_world(tmp_path: Path, device: str) -> None:
         ({"solver.dt": 1e-7}, "solver.dt"),
         ({"bodies.0.size": 2.0}, "bodies.0"),
         ({"bodies.0.particles_per_edge": 4}, "bodies.0"),
+        ({"bodies.0.pinned": [{"indices": [0]}]}, "bodies.0.pinned"),
+        ({"soft_contact.mode": "all"}, "soft_contact.mode"),
         ({"bodies.0": {"type": "voxels", "layers": [["#"]], "material": "m"}}, "bodies.0"),
         ({"materials.m.law": "strain"}, "materials.m.law"),
         ({"materials.m.shear.stiffness": 60.0}, "materials.m.shear"),
@@ -352,6 +357,10 @@ def test_a_scene_that_fits_becomes_a_world(tmp_path: Path, device: str) -> None:
         ({"colliders.1.damping": 3.0}, "colliders.1.damping"),
         ({"colliders.0": {"type": "sphere", "radius": 1.0, "pulls": True}}, "colliders.0.type"),
         ({"colliders.0": {"type": "half_space", "normal": [1.0, 0.0, 0.0], "pulls": True}}, "colliders"),
+        ({"contact.damping": 2e-7}, "colliders.0.damping"),
+        ({"gravity": [0.0, 0.0, 1e-4]}, "gravity times particle_mass"),
+        ({"fields.0.force": [0.0, -1e-7, 0.0]}, "fields.0.force"),
+        ({"fields.0": {**EMPTY_GRID, "forces": [[1e-7, 0.0, 0.0]] * 8}}, "fields.0"),
         ({"fields.0.curve": [[0.0, 1.0]]}, "fields.0.curve"),
         ({"fields.0": {"type": "magnetic", "strength": [1.0, 0.0, 0.0]}}, "fields.0.type"),
     ],
@@ -362,6 +371,34 @@ def test_a_scene_that_does_not_fit_is_refused(tmp_path: Path, overrides: dict[st
     with pytest.raises(InputError, match=f"does not fit a world file: {said} "):
         write_world(load_scene(tmp_path / "a.toml", overrides=overrides), tmp_path / "a.w")
     assert not (tmp_path / "a.w").exists()
+
+
+def test_springs_of_a_world_keep_their_constants(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Refuse a damping that six decimals make 0, warn of one that they change, and take a true 0."""
+    (tmp_path / "a.toml").write_text(FITTING)
+    same = {f"materials.m.{kind}.damping": 2e-7 for kind in ("structural", "shear", "bend")}
+    with pytest.raises(InputError, match=r"materials\.m\.structural\.damping = 2e-07 is 0"):
+        write_world(load_scene(tmp_path / "a.toml", overrides=same), tmp_path / "a.w")
+    with caplog.at_level(logging.WARNING, "warpjelly"):
+        write_world(load_scene(tmp_path / "a.toml", overrides=dict.fromkeys(same, 0.0)), tmp_path / "a.w")
+        assert not caplog.records
+        write_world(load_scene(tmp_path / "a.toml", overrides=dict.fromkeys(same, 1.4e-6)), tmp_path / "b.w")
+    assert "materials.m.structural.damping = 1.4e-06 is written as 0.000001" in caplog.text
+
+
+@pytest.mark.parametrize("normal", [[0.0, 0.0, 1e-7], [1e-5, 2e-5, 2.5e-6], [3e11, 4e11, 1e12]])
+def test_a_plane_keeps_its_place_whatever_the_length_of_its_normal(tmp_path: Path, normal: list[float]) -> None:
+    """Find the direction and the distance of a half-space again, to the six decimals of the format."""
+    (tmp_path / "a.toml").write_text(FITTING)
+    scene = load_scene(
+        tmp_path / "a.toml", overrides={"colliders.1.normal": normal, "colliders.1.center": [0.0, 0.0, -9.0]}
+    )
+    write_world(scene, tmp_path / "a.w")
+    found = load_scene(tmp_path / "a.w").colliders[1]
+    unit = np.array(normal) / np.linalg.norm(normal)
+    # Half of 1e-6 for each component; the centre is the point next to the origin, 9 m away at most.
+    np.testing.assert_allclose(found.normal / np.linalg.norm(found.normal), unit, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(found.center, unit * (unit[2] * -9.0), rtol=0, atol=(1 + 2 * 9) * 1e-6)
 
 
 def test_gravity_and_constants_join_the_grid(tmp_path: Path) -> None:
@@ -389,3 +426,14 @@ def test_a_world_that_is_there_is_kept_unless_forced(tmp_path: Path) -> None:
     assert (tmp_path / "b.w").read_text() == before
     with pytest.raises(InputError, match=r"ends in \.w"):
         write_world(scene, tmp_path / "c.txt")
+
+
+def test_a_world_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
+    """Name the file whose folder is missing, and leave no unfinished file where the name is a folder's."""
+    scene = load_scene(write(tmp_path / "a.w", WORLDS["left"]))
+    with pytest.raises(EnvironmentFailedError, match=r"none/b\.w: cannot write the world: No such file or directory"):
+        write_world(scene, tmp_path / "none" / "b.w")
+    (tmp_path / "b.w").mkdir()
+    with pytest.raises(EnvironmentFailedError, match=r"b\.w: cannot write the world: Is a directory"):
+        write_world(scene, tmp_path / "b.w", force=True)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.w", "b.w"]

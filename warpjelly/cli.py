@@ -5,16 +5,19 @@ from __future__ import annotations
 import json
 import logging
 import os
+import re
 import signal
 import sys
 import tomllib
 import traceback
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from .errors import EnvironmentFailedError, InputError, WarpjellyError
+from .errors import EnvironmentFailedError, InputError, SceneError, WarpjellyError
 
 if TYPE_CHECKING:
     from .expect import Outcome
@@ -90,17 +93,20 @@ def run(
     from rich.console import Console
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-    with Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("frames  {task.fields[rate]}"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-        console=Console(stderr=True),
-        disable=quiet or not sys.stderr.isatty(),
-        transient=True,
-    ) as bar:
+    with (
+        _named(scene),
+        Progress(
+            TextColumn("{task.description}"),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TextColumn("frames  {task.fields[rate]}"),
+            TimeRemainingColumn(),
+            TextColumn("left"),
+            console=Console(stderr=True),
+            disable=quiet or not sys.stderr.isatty(),
+            transient=True,
+        ) as bar,
+    ):
         task = bar.add_task("building", total=loaded.frame_count, rate="")
 
         def show(done: int, total: int) -> None:
@@ -136,7 +142,8 @@ def check(
 
     from .run import forecast
 
-    figures = forecast(loaded, device=device)
+    with _named(scene):
+        figures = forecast(loaded, device=device)
     if as_json:
         print(json.dumps(figures))
         return
@@ -182,13 +189,12 @@ def preview(
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of a frame in pixels.")] = "960x540",
 ) -> None:
     """Look at a result without a USD viewer."""
-    width, _, height = size.partition("x")
-    if not (width.isdigit() and height.isdigit()):
+    if not (sides := re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size)):
         raise InputError(f"--size {size}: give width x height in pixels, for example 960x540")
 
     from .preview import render_preview
 
-    render_preview(source, output, frames=frames or None, size=(int(width), int(height)))
+    render_preview(source, output, frames=frames or None, size=(int(sides[1]), int(sides[2])))
     print(f"picture: {output}")
 
 
@@ -204,7 +210,8 @@ def export_world(
 
     from .worldfile import write_world
 
-    write_world(loaded, output, force=force)
+    with _named(scene):
+        write_world(loaded, output, force=force)
     print(f"world: {output}")
 
 
@@ -295,7 +302,7 @@ def _overrides(settings: list[str]) -> dict[str, Any]:
             raise InputError(f"--set {setting}: give KEY=VALUE, for example --set solver.dt=5e-4")
         try:
             overrides[key.strip()] = tomllib.loads(f"value = {text}")["value"]
-        except ValueError:
+        except (ValueError, RecursionError):
             overrides[key.strip()] = text.strip()
     return overrides
 
@@ -304,6 +311,15 @@ def _load(path: Path, overrides: dict[str, Any], frames: int | None) -> Scene:
     from .scenefile import load_scene
 
     return load_scene(path, overrides=overrides, frames=frames)
+
+
+@contextmanager
+def _named(path: Path) -> Iterator[None]:
+    """Name the scene file where its scene cannot be built, as errors of validation do."""
+    try:
+        yield
+    except SceneError as error:
+        raise SceneError(f"{path}: {error}") from error
 
 
 def _summarize(record: dict[str, Any], outcomes: list[Outcome]) -> None:

@@ -15,6 +15,10 @@ class InputError(WarpjellyError):
     exit_code = 2
 
 
+class SceneError(InputError):
+    """A scene that is valid by itself cannot be built or written; the message does not name its file."""
+
+
 class DivergedError(WarpjellyError):
     """The simulation left the world; what was simulated before is kept."""
 

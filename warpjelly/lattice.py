@@ -35,7 +35,7 @@ from warpjelly.kernels.lattices import (
 from warpjelly.kernels.springs import MAX_SPAN
 
 from .device import start_warp
-from .errors import InputError
+from .errors import SceneError
 
 # Rest lengths of the four kinds of springs, in unit cells.
 REST_LENGTHS = np.sqrt([1.0, 2.0, 3.0, 4.0])
@@ -120,7 +120,7 @@ def build_lattice(
         weighted: tell springs apart by how many cells contain them, too; otherwise there are four classes, the kinds.
 
     Raises:
-        InputError: the grid has more vertices than can be numbered.
+        SceneError: the grid has more vertices than can be numbered.
     """
     unit = cell_size / (particles_per_edge - 1)
     grid, particle_count = _number_particles(cells, particles_per_edge - 1)
@@ -240,7 +240,7 @@ def _number_particles(cells: np.ndarray, refinement: int) -> tuple[Grid, int]:
     lengths = np.where(high > low, high - low, 0)
     vertex_count = int(lengths.sum())
     if vertex_count > MAX_VERTICES:
-        raise InputError(f"a grid of {vertex_count:,} vertices is more than the {MAX_VERTICES:,} that can be numbered")
+        raise SceneError(f"a grid of {vertex_count:,} vertices is more than the {MAX_VERTICES:,} that can be numbered")
 
     def array(data: np.ndarray, dtype: Any) -> wp.array:
         return wp.array(data, dtype=dtype, device="cpu")

@@ -12,7 +12,7 @@ import warp as wp
 from warpjelly.kernels import bounds, contacts, fields, pairs, springs
 from warpjelly.kernels.lattices import BEND, BODY_SHEAR, FACE_SHEAR, STRUCTURAL
 
-from .errors import InputError
+from .errors import SceneError
 from .lattice import Lattice
 from .plan import Plan
 from .scene import (
@@ -303,7 +303,7 @@ def _pinned(lattice: Lattice, body: AnyBody) -> np.ndarray:
     """Return which particles never move, bool [particle_count].
 
     Raises:
-        InputError: an entry pins a particle that does not exist, or none at all.
+        SceneError: an entry pins a particle that does not exist, or none at all.
     """
     x = lattice.particles
     pinned = np.zeros(len(x), bool)
@@ -311,14 +311,14 @@ def _pinned(lattice: Lattice, body: AnyBody) -> np.ndarray:
         key = f"bodies.{body.name}.pinned.{number}"
         if pin.indices is not None:
             if max(pin.indices) >= len(x):
-                raise InputError(f"{key}.indices: no particle {max(pin.indices)}; they are 0 to {len(x) - 1}")
+                raise SceneError(f"{key}.indices: no particle {max(pin.indices)}; they are 0 to {len(x) - 1}")
             pinned[pin.indices] = True
         else:
             margin = PIN_MARGIN * lattice.unit
             inside = ((x >= np.array(pin.lower) - margin) & (x <= np.array(pin.upper) + margin)).all(axis=1)
             if not inside.any():
                 low, high = (np.array2string(corner, precision=4, separator=", ") for corner in (x.min(0), x.max(0)))
-                raise InputError(f"{key}: pins no particle; the body reaches from {low} to {high} m in its own frame")
+                raise SceneError(f"{key}: pins no particle; the body reaches from {low} to {high} m in its own frame")
             pinned |= inside
     return pinned
 

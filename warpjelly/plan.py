@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import InputError
+from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
 from .network import build_cloth, build_network
 from .scene import MAX_LENGTH, MIN_LENGTH, AnyBody, ClothBody, CubeBody, ModelBody, NetworkBody, Scene
@@ -92,12 +92,12 @@ def plan_scene(scene: Scene) -> Plan:
     """Find out how every body is made and count what follows from it.
 
     Raises:
-        InputError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
+        SceneError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
     plan = Plan(scene, [_plan_body(body, scene) for body in scene.bodies])
     most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]
     if plan.particle_count > most:
-        raise InputError(f"{plan.particle_count:,} particles are more than the {most:,} that arrays can hold")
+        raise SceneError(f"{plan.particle_count:,} particles are more than the {most:,} that arrays can hold")
     _require_memory(plan.memory_bytes, f"{plan.particle_count:,} particles and {plan.spring_bound:,} springs")
     return plan
 
@@ -141,7 +141,7 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
     mesh = load_mesh(body.file)
     largest = mesh.extents.max() * body.scale
     if not MIN_LENGTH <= largest <= MAX_LENGTH:
-        raise InputError(
+        raise SceneError(
             f"{body.file}: the model is {largest:.3g} m large; between {MIN_LENGTH:g} and {MAX_LENGTH:g} m can be "
             f"simulated: change bodies.{body.name}.scale"
         )
@@ -155,7 +155,7 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
     )
     if not grid.cells.any():
         finer = next((n for n in _FINER if n > body.resolution and voxelize(mesh.triangles, n).cells.any()), None)
-        raise InputError(
+        raise SceneError(
             f"{body.file}: no cell of the grid has its centre inside the model at resolution {body.resolution}; "
             + (f"resolution {finer} has some" if finer else "set keep_thin_parts to fill those it passes through")
         )
@@ -167,7 +167,7 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
 def _require_memory(needed: float, what: str) -> None:
     available = memory_limit()
     if needed > available:
-        raise InputError(
+        raise SceneError(
             f"{what} need about {needed / 1e9:.1f} GB of memory, of {available / 1e9:.1f} GB on this machine; "
             "lower the resolution or the particles per edge"
         )

@@ -9,7 +9,6 @@ from __future__ import annotations
 import difflib
 import json
 import math
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -44,6 +43,8 @@ DEFAULT_PARTICLE_MASS = 0.01  # kg
 # A scene asks for at most this many samples and substeps per frame; more would never finish.
 MAX_FRAMES = 1_000_000
 MAX_SUBSTEPS = 1_000_000
+# Time steps beyond these [s] are typing errors.
+MIN_STEP, MAX_STEP = 1e-9, 1.0
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_MAGNITUDE)]
@@ -52,7 +53,7 @@ Coordinate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_LE
 Length = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_LENGTH, le=MAX_LENGTH)]
 Mass = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_MASS, le=MAX_MAGNITUDE)]
 Rate = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_RATE, le=MAX_RATE)]
-Step = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=1e-9, le=1.0)]
+Step = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=MIN_STEP, le=MAX_STEP)]
 Vector = tuple[Number, Number, Number]
 Rates = tuple[Rate, Rate, Rate]
 Point = tuple[Coordinate, Coordinate, Coordinate]
@@ -560,13 +561,16 @@ def _read_array(file: Path) -> np.ndarray:
     """Read a .npy file, or a .npz file with one array, as float64."""
     try:
         data = np.load(file, allow_pickle=False)
-        if isinstance(data, np.ndarray):
-            return data.astype(float)
-        with data:
-            (name,) = data.files
-            return data[name].astype(float)
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
-        what = {"file": str(file), "why": str(error)}
+        if not isinstance(data, np.ndarray):
+            with data:
+                (name,) = data.files
+                data = data[name]
+        if not isinstance(data, np.ndarray) or data.dtype.kind not in "fiu":
+            raise ValueError(f"it holds {getattr(data, 'dtype', 'something else')}")
+        return data.astype(float)
+    # NumPy raises whatever its parsing happens to trip over; all of it means that the file is broken.
+    except Exception as error:
+        what = {"file": str(file), "why": str(error) or type(error).__name__}
         raise PydanticCustomError("grid", "{file}: not a NumPy file with one array of numbers: {why}", what) from error
 
 
@@ -709,9 +713,10 @@ class Scene(Table):
         if not isinstance(data, Mapping) or "fps" in data or not isinstance(data.get("solver"), Mapping):
             return data
         steps, dt = data["solver"].get("steps_per_frame"), data["solver"].get("dt", Solver.model_fields["dt"].default)
-        # Whatever is not a number is refused where it belongs.
-        numbers = isinstance(steps, int) and isinstance(dt, float | int) and steps > 0 and dt > 0
-        return {**data, "fps": 1.0 / (steps * dt)} if numbers else data
+        # Whatever is no such number is refused where it belongs.
+        counted = isinstance(steps, int) and 1 <= steps <= MAX_SUBSTEPS
+        timed = isinstance(dt, float | int) and MIN_STEP <= dt <= MAX_STEP
+        return {**data, "fps": 1.0 / (steps * dt)} if counted and timed else data
 
     @model_validator(mode="after")
     def _parts_fit_together(self) -> Self:

@@ -56,6 +56,8 @@ def _read_toml(path: Path) -> dict[str, Any]:
     # TOML's own errors are among these, and numbers of thousands of digits.
     except ValueError as error:
         raise InputError(f"{path}: not valid TOML: {error}") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: not valid TOML: lists or tables are nested too deep") from error
     except OSError as error:
         raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
 
@@ -87,8 +89,8 @@ def _entry(entries: list[Any], part: str, key: str) -> int:
     ]
     if part in names:
         return names.index(part)
-    if part.isdigit() and int(part) < len(entries):
-        return int(part)
+    if part in (numbers := [str(i) for i in range(len(entries))]):
+        return numbers.index(part)
     known = ", ".join([f"0 to {len(entries) - 1}", *(name for name in names if name)]) if entries else "none"
     raise InputError(f"--set {key}: no entry '{part}'; entries: {known}")
 
@@ -174,7 +176,8 @@ def _tags(table: type[Table]) -> tuple[str, ...]:
 def _shown(value: Any) -> str:
     """Write a value as TOML would, cut when long."""
     try:
-        text = json.dumps(value, ensure_ascii=False)
-    except (TypeError, ValueError):
-        text = repr(value)
+        text = json.dumps(value, ensure_ascii=False, default=str)
+    # Numbers of thousands of digits and tables of thousands of levels.
+    except (ValueError, RecursionError):
+        text = "..."
     return text if len(text) <= 80 else text[:77] + "..."

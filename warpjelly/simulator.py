@@ -13,7 +13,7 @@ import warp as wp
 from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, surfaces
 
 from .device import choose_device
-from .errors import DivergedError, InputError
+from .errors import DivergedError, SceneError
 from .model import Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
@@ -47,7 +47,7 @@ class Simulator:
         device: "auto", "cpu", "cuda:0" ...
 
     Raises:
-        InputError: the scene cannot be built, or there is no such device.
+        InputError: the scene cannot be built (SceneError), or there is no such device.
     """
 
     def __init__(self, scene: Scene | Plan, *, device: str = "auto") -> None:
@@ -222,7 +222,7 @@ class Simulator:
         limit = limits[solver.integrator]
         if limit is None:
             others = ", ".join(name for name, other in limits.items() if other is not None)
-            raise InputError(
+            raise SceneError(
                 f'solver.dt = "auto": {solver.integrator} has no stable step for this scene, where something is '
                 f"undamped; integrators that have one: {others}"
             )
@@ -230,7 +230,7 @@ class Simulator:
         magnetic = magnetic_limits(self.model, self._duration)[solver.integrator]
         step = min(SAFETY[solver.integrator] * limit, math.inf if bounce is None else bounce, magnetic)
         if self.scene.substeps_for(step) > MAX_SUBSTEPS:
-            raise InputError(
+            raise SceneError(
                 f'solver.dt = "auto": a stable step of {step:.3g} s makes more than {MAX_SUBSTEPS} substeps a frame; '
                 "lower stiffness or damping, or raise the particle mass"
             )

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from .errors import InputError
+from .errors import EnvironmentFailedError, InputError, SceneError
+from .files import whole_file
 from .scene import (
     DEFAULT_PARTICLE_MASS,
     MAX_LENGTH,
@@ -210,6 +210,7 @@ def write_world(scene: Scene, path: str | Path, *, force: bool = False) -> None:
 
     Raises:
         InputError: the scene does not fit the format, and the message names the key; or the file exists.
+        EnvironmentFailedError: the file cannot be written.
     """
     path = Path(path)
     if path.suffix.lower() != SUFFIX:
@@ -217,9 +218,11 @@ def write_world(scene: Scene, path: str | Path, *, force: bool = False) -> None:
     if path.exists() and not force:
         raise InputError(f"{path}: exists already; replace it with --force")
     text = _format(scene)
-    temporary = path.with_name(f"{path.name}.tmp.{os.getpid()}")
-    temporary.write_text(text, encoding="ascii", newline="\n")
-    os.replace(temporary, path)
+    try:
+        with whole_file(path) as unfinished:
+            unfinished.write_text(text, encoding="ascii", newline="\n")
+    except OSError as error:
+        raise EnvironmentFailedError(f"{path}: cannot write the world: {error.strerror or error}") from error
 
 
 def _format(scene: Scene) -> str:
@@ -230,19 +233,25 @@ def _format(scene: Scene) -> str:
     body = scene.bodies[0]
     if not (isinstance(body, CubeBody) and math.isclose(body.size, CUBE_SIZE) and body.particles_per_edge == 8):
         raise _unfit("bodies.0", "is not a cube of size 1 with 8 particles per edge")
-    material = scene.materials[body.material]
-    constants, mass = _one_kind(material, f"materials.{body.material}")
+    _require(not body.pinned, "bodies.0.pinned", "is given; a world pins no particle")
+    _require(not scene.soft_contacts, "soft_contact.mode", "is all; the cube of a world does not collide with itself")
+    key = f"materials.{body.material}"
+    springs, mass = _one_kind(scene.materials[body.material], key)
     plane, contact = _contact(scene)
-    if contact[0] > 0:
-        _written(contact[0], "colliders.0.stiffness")
+    constants = {
+        f"{key}.structural.stiffness": springs[0],
+        f"{key}.structural.damping": springs[1],
+        "colliders.0.stiffness": contact[0],
+        "colliders.0.damping": contact[1],
+    }
     _require(scene.solver.dt != "auto", "solver.dt", "is auto; a world has a number")
     substeps = scene.substeps_for(float(scene.solver.dt))
     lines = [
         names[scene.solver.integrator],
         f"{_written(scene.dt_for(substeps), 'solver.dt')} {substeps}",
-        " ".join(f"{value:.6f}" for value in (*constants, *contact)),
-        _written(mass, f"materials.{body.material}.particle_mass"),
-        "0" if plane is None else "1\n" + _vector([*plane.normal, -float(np.dot(plane.center, plane.normal))]),
+        " ".join(_written(value, name) for name, value in constants.items()),
+        _written(mass, f"{key}.particle_mass"),
+        "0" if plane is None else "1\n" + _vector(_coefficients(plane)),
     ]
     grid = _grid(scene, mass)
     lines.append(str(len(grid)))
@@ -257,8 +266,8 @@ def _format(scene: Scene) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _unfit(key: str, why: str) -> InputError:
-    return InputError(f"the scene does not fit a world file: {key} {why}")
+def _unfit(key: str, why: str) -> SceneError:
+    return SceneError(f"the scene does not fit a world file: {key} {why}")
 
 
 def _require(fits: bool, key: str, why: str) -> None:
@@ -272,9 +281,9 @@ def _vector(values: Any) -> str:
 
 
 def _written(value: float, key: str) -> str:
-    """Return a positive number with the six decimals of the format, and say what they lose."""
+    """Return a constant with the six decimals of the format, and say what they lose."""
     text = f"{value:.6f}"
-    _require(float(text) > 0, key, f"= {value:g} is 0 with the six decimals of the format")
+    _require(float(text) != 0 or value == 0, key, f"= {value:g} is 0 with the six decimals of the format")
     if not math.isclose(float(text), value, rel_tol=1e-9):
         log.warning("%s = %.9g is written as %s, with the six decimals of the format", key, value, text)
     return text
@@ -319,14 +328,26 @@ def _contact(scene: Scene) -> tuple[HalfSpaceCollider | None, tuple[float, float
     return (planes[0] if planes else None), (first.stiffness, first.damping)
 
 
+def _coefficients(plane: HalfSpaceCollider) -> np.ndarray:
+    """Return a, b, c, d of a x + b y + c z + d = 0: as given where six decimals hold them, or else of length 1."""
+    coefficients = np.array([*plane.normal, -np.dot(plane.center, plane.normal)])
+    # The tolerances are for the rounding of d alone, which follows from the centre.
+    held = np.allclose(np.round(coefficients, 6), coefficients, rtol=1e-9, atol=1e-12)
+    return coefficients if held and abs(coefficients[3]) <= MAX_MAGNITUDE else coefficients / math.hypot(*plane.normal)
+
+
 def _grid(scene: Scene, mass: float) -> np.ndarray:
     """Return the forces of gravity and all fields at the nodes, float64 [R, R, R, 3], N; empty without any."""
     everywhere = mass * scene.gravity_vector
+    for weight in everywhere:
+        _written(weight, "gravity times particle_mass")
     grid = None
     for i, field in enumerate(scene.fields):
         key = f"fields.{i}"
         _require(field.curve is None, f"{key}.curve", "is given; a field of a world is constant in time")
         if isinstance(field, ConstantField):
+            for component in field.force:
+                _written(component, f"{key}.force")
             everywhere = everywhere + field.force
         elif isinstance(field, GridField):
             fits = field.lower == (-BOX_REACH,) * 3 and field.upper == (BOX_REACH,) * 3
@@ -334,6 +355,7 @@ def _grid(scene: Scene, mass: float) -> np.ndarray:
             _require(field.outside == "clamp", f"{key}.outside", "is not clamp")
             _require(grid is None, key, "is a second grid; a world has at most one")
             grid = field.nodes()
+            _require(bool(grid.round(6).any() or not grid.any()), key, "is 0 with the six decimals of the format")
             _require(len(grid) <= MAX_RESOLUTION, key, f"has more than {MAX_RESOLUTION} nodes along an axis")
         else:
             raise _unfit(f"{key}.type", f"is {field.type}; a world has constant and grid fields")
