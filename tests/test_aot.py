@@ -19,7 +19,7 @@ import warpjelly.kernels
 from warpjelly.device import start_warp
 from warpjelly.kernels import springs
 from warpjelly.simulator import Simulator
-from warpjelly.voxelize import voxelize
+from warpjelly.voxelize import find_pieces, voxelize
 
 ARCHITECTURES = (80, 90)
 
@@ -56,7 +56,9 @@ def launch_everything() -> None:
             outputs=[state.f, state.spring_losses],
             device="cpu",
         )
-    voxelize(np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]]), 2, device="cpu")
+    triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
+    voxelize(triangle, 2, method="vote", device="cpu")
+    find_pieces(np.ones((1, 1, 1), bool))
 
 
 def precisions_of(kernel: wp.Kernel) -> list[str]:

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 import trimesh
 from manifold3d import Manifold, Mesh64
+from test_models import winding_numbers
 
 from warpjelly.kernels.voxels import SUBCELLS
 from warpjelly.meshes import load_mesh
-from warpjelly.voxelize import VoxelGrid, voxelize
+from warpjelly.voxelize import VoxelGrid, choose_method, find_pieces, keep_largest_piece, voxelize, voxelize_mesh
 
 MODELS = Path(__file__).parents[1] / "scenes" / "models"
 
@@ -25,7 +26,7 @@ def sign_of(*terms: int) -> int:
 def find_inside(triangles: np.ndarray, shape: tuple[int, int, int]) -> np.ndarray:
     """Say which cell centres, shifted by (e, e^2, e^3), are inside integer triangles.
 
-    Parity of the crossings of a ray towards +z, another one than the product's, in Python's integers alone.
+    Parity of the crossings of a ray towards +z, in Python's integers alone.
     """
     crossings = np.zeros(shape, int)
     for corners in triangles.tolist():
@@ -191,12 +192,169 @@ def test_models_keep_their_volume(name: str, resolution: int, device: str) -> No
 def test_open_mesh_reports_its_open_columns(device: str) -> None:
     """Count the columns through the missing side of a box, and those through a hole of one triangle."""
     mesh = trimesh.creation.box((1.0, 1.0, 1.0))
-    triangles, outward = np.asarray(mesh.triangles), mesh.face_normals[:, 0]
+    triangles, outward = np.asarray(mesh.triangles), mesh.face_normals[:, 2]
     assert voxelize(triangles, 6, device=device).open_columns == 0
-    # Without one side in x every column crosses the surface once; without the sides in x none does.
+    # Without one side in z every column crosses the surface once; without the sides in z none does.
     for sign in (-1, 1):
         assert voxelize(triangles[outward != sign], 6, device=device).open_columns == 36
     assert voxelize(triangles[outward == 0], 6, device=device).open_columns == 0
     # A missing triangle leaves the columns of half the side open, with or without its diagonal.
     hole = np.delete(triangles, np.flatnonzero(outward == 1)[0], axis=0)
     assert voxelize(hole, 6, device=device).open_columns in (15, 21)
+
+
+def count_windings(mesh: trimesh.Trimesh, grid: VoxelGrid) -> np.ndarray:
+    """Return how often a closed mesh goes round each cell's centre, by solid angles, [x, y, z]."""
+    centers = grid.origin + (np.stack(np.indices(grid.cells.shape), axis=-1).reshape(-1, 3) + 0.5) * grid.cell_size
+    return np.rint(winding_numbers(mesh, centers)).astype(int).reshape(grid.cells.shape)
+
+
+def overlap() -> trimesh.Trimesh:
+    """Return two balls that cut into each other, and a third one, inside out, in the first: windings 0, 1 and 2."""
+    balls = [trimesh.creation.icosphere(subdivisions=2) for _ in range(3)]
+    balls[1].apply_translation([0.9, 0.2, 0.1])
+    balls[2].apply_scale(0.4).apply_translation([-0.4, 0.0, 0.0]).invert()
+    return trimesh.util.concatenate(balls)
+
+
+def test_winding_fills_what_any_surface_goes_round(device: str) -> None:
+    """Fill the union of balls that overlap, less a hollow, where parity leaves the overlap empty."""
+    mesh = overlap()
+    grid = voxelize(np.asarray(mesh.triangles), 17, method="winding", device=device)
+    windings = count_windings(mesh, grid)
+    assert set(np.unique(windings)) == {0, 1, 2}
+    np.testing.assert_array_equal(grid.cells, windings != 0)
+    assert grid.open_columns == 0
+    parity = voxelize(np.asarray(mesh.triangles), 17, device=device)
+    np.testing.assert_array_equal(parity.cells, windings % 2 == 1)
+
+
+def test_windings_count_both_ways_up_to_seven(device: str) -> None:
+    """Fill inside of balls within balls, whichever way they turn, up to seven times round."""
+    balls = [trimesh.creation.icosphere(subdivisions=1, radius=radius) for radius in np.linspace(0.4, 1.0, 7)]
+    for count in range(1, 8):
+        for turned_over in (False, True):
+            mesh = trimesh.util.concatenate(balls[-count:])
+            if turned_over:
+                mesh.invert()
+            grid = voxelize(np.asarray(mesh.triangles), 9, method="winding", device=device)
+            windings = count_windings(mesh, grid)
+            assert windings.min() == (-count if turned_over else 0)
+            np.testing.assert_array_equal(grid.cells, windings != 0)
+
+
+@pytest.mark.parametrize(
+    ("make", "closed", "method", "faults"),
+    [
+        (lambda: trimesh.creation.box(), True, "parity", []),
+        (CLOSED["union"], True, "parity", []),
+        (lambda: trimesh.Trimesh(*invert(trimesh.creation.box()), process=False), True, "parity", ["is inside out"]),
+        (overlap, True, "winding", ["intersects itself"]),
+        (lambda: trimesh.creation.box(), False, "vote", ["is not watertight"]),
+    ],
+    ids=["box", "union", "inside out", "overlap", "open"],
+)
+def test_the_method_suits_the_mesh(make, closed: bool, method: str, faults: list[str], device: str) -> None:
+    """Choose the method by what is wrong with a mesh, and say what that is."""
+    assert choose_method(np.asarray(make().triangles), closed=closed, device=device) == (method, faults)
+
+
+def invert(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return vertices and faces of a mesh turned inside out."""
+    return mesh.vertices, mesh.faces[:, ::-1]
+
+
+@pytest.mark.parametrize(
+    "is_missing",
+    [
+        lambda normals: normals[:, 2] == 1,
+        lambda normals: np.abs(normals[:, 0]) == 1,
+        lambda normals: np.isin(np.arange(12), [np.argmax(normals[:, 0]), np.argmax(normals[:, 1])]),
+    ],
+    ids=["a side", "opposite sides", "halves of two sides"],
+)
+def test_a_vote_fills_a_mesh_with_holes(is_missing, device: str) -> None:
+    """Fill a box that lacks triangles like the whole one."""
+    box = trimesh.creation.box((3.0, 2.0, 4.0))
+    triangles = np.asarray(box.triangles)
+    whole = voxelize(triangles, 8, device=device)
+    holed = voxelize(triangles[~is_missing(np.rint(box.face_normals))], 8, method="vote", device=device)
+    np.testing.assert_array_equal(holed.cells, whole.cells)
+
+
+def test_a_vote_is_within_the_winding_number_of_a_broken_scan(device: str) -> None:
+    """Fill a ball that lacks a tenth of its triangles, up to cells whose solid angle leaves it open."""
+    mesh = trimesh.creation.icosphere(subdivisions=3)
+    kept = np.random.default_rng(2).random(len(mesh.faces)) > 0.1
+    broken = trimesh.Trimesh(mesh.vertices, mesh.faces[kept], process=False)
+    grid, notes = voxelize_mesh(broken, 20, device=device)
+    assert grid.method == "vote"
+    assert "not watertight" in notes[0]
+    whole = voxelize(np.asarray(mesh.triangles), 20, device=device)
+    centers = grid.origin + (np.argwhere(grid.cells != whole.cells) + 0.5) * grid.cell_size
+    # Where a ray along each axis sees no hole, parity is right; the rest is at holes, near the surface.
+    assert (np.abs(np.linalg.norm(centers, axis=1) - 1) < 0.25).all()
+    assert len(centers) < 0.03 * np.count_nonzero(whole.cells)
+
+
+def test_thin_parts_are_counted_and_kept_on_request(device: str) -> None:
+    """Lose a fin much thinner than a cell, say by how many triangles, and keep it as the cells it passes through."""
+    fin = trimesh.creation.box(bounds=[[1.0, -0.02, -0.5], [3.0, 0.02, 0.5]])
+    mesh = join(trimesh.creation.box((2.2, 2.0, 2.0)), fin)
+    triangles = np.asarray(mesh.triangles)
+    plain = voxelize(triangles, 10, device=device)
+    assert not plain.cells[6:].any()
+    # The fin's twelve triangles but for those hidden in the block; the cut may have split some.
+    beyond = triangles[:, :, 0].max(axis=1) > 1.1 + 2 * plain.cell_size
+    assert 6 <= plain.thin_triangles <= beyond.sum()
+    kept = voxelize(triangles, 10, keep_thin_parts=True, device=device)
+    assert kept.thin_triangles == plain.thin_triangles
+    added = np.argwhere(kept.cells & ~plain.cells)
+    assert (kept.cells | plain.cells == kept.cells).all()
+    low = kept.origin + added * kept.cell_size
+    assert (low[:, 1] <= 0.02).all()
+    assert (low[:, 1] + kept.cell_size >= -0.02).all()
+    assert (low[:, 0] >= 1.1 - kept.cell_size).all()
+    # In one piece, up to the end of the fin.
+    assert kept.cells.any(axis=(1, 2)).all()
+    assert len(find_pieces(kept.cells)[1]) == 1
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_pieces_match_a_flood_fill(seed: int) -> None:
+    """Find the pieces of random grids, by falling size, as a flood through faces does."""
+    rng = np.random.default_rng(seed)
+    cells = rng.random(rng.integers(1, 9, 3)) < rng.choice([0.2, 0.4, 0.6, 1.0])
+    cells[0, 0, 0] = True
+    label = np.where(cells, 0, -1)
+    sizes = []
+    for cell in np.argwhere(cells):
+        if label[tuple(cell)] == 0:
+            sizes.append(0)
+            front = [tuple(int(c) for c in cell)]
+            while front:
+                at = front.pop()
+                if all(0 <= c < n for c, n in zip(at, cells.shape, strict=True)) and label[at] == 0:
+                    label[at] = len(sizes)
+                    sizes[-1] += 1
+                    front += [tuple(np.add(at, sign * np.eye(3, dtype=int)[k])) for k in range(3) for sign in (-1, 1)]
+    _, found = find_pieces(cells)
+    assert found.tolist() == sorted(sizes, reverse=True)
+    grid = VoxelGrid(cells, np.zeros(3), 1.0, "parity", 0, 0)
+    largest = keep_largest_piece(grid).cells
+    assert np.count_nonzero(largest) == max(sizes)
+    (number,) = set(np.unique(label[largest]))
+    np.testing.assert_array_equal(largest, label == number)
+
+
+def test_all_that_is_wrong_is_said_at_once(device: str) -> None:
+    """Say everything that is wrong with a mesh at once, and keep its largest piece alone where asked to."""
+    apart = trimesh.creation.box((0.5, 0.5, 0.5)).apply_translation([3.0, 0.0, 0.0])
+    mesh = trimesh.util.concatenate([overlap(), apart])
+    grid, notes = voxelize_mesh(mesh, 30, device=device)
+    assert [note.split(",")[0].split(":")[0] for note in notes] == [
+        "the mesh intersects itself; method winding",
+        "it has 2 pieces that no face joins",
+    ]
+    alone, _ = voxelize_mesh(mesh, 30, pieces="largest", device=device)
+    assert find_pieces(grid.cells)[1].tolist() == [np.count_nonzero(alone.cells), 3 * 3 * 4]

@@ -26,6 +26,8 @@ BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 BYTES_AT_REST = 290e6
 BYTES_PER_PARTICLE = {"float32": 240, "float64": 280}
 BYTES_PER_SPAN = 64
+# Resolutions to try where a model has no voxel.
+_FINER = [2**k for k in range(2, 9)]
 # Points, normals, colours and forces of a surface point at a frame; all of them are in memory until the stage is whole.
 BYTES_PER_SURFACE_SAMPLE = 36
 # Scan conversion holds one byte per cell three times, counting what follows from them some more.
@@ -134,7 +136,7 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
 def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
     # These imports take most of a second, which scenes without models need not spend.
     from .meshes import load_mesh
-    from .voxelize import voxelize
+    from .voxelize import voxelize, voxelize_mesh
 
     mesh = load_mesh(body.file)
     largest = mesh.extents.max() * body.scale
@@ -148,19 +150,18 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
     _require_memory(
         BYTES_AT_REST + BYTES_PER_GRID_CELL * cell_count, f"bodies.{body.name}: a grid of {cell_count:,} cells"
     )
-    grid = voxelize(np.asarray(mesh.triangles) * body.scale, body.resolution)
-    if grid.open_columns or not mesh.is_watertight:
-        columns = grid.cells.shape[1] * grid.cells.shape[2]
-        harm = "no voxel is concerned"
-        if grid.open_columns:
-            harm = f"{grid.open_columns} of its {columns} columns of voxels run through a hole and may be wrong"
-        log.warning("%s: the mesh is not watertight; %s", body.file, harm)
+    grid, notes = voxelize_mesh(
+        mesh, body.resolution, method=body.method, keep_thin_parts=body.keep_thin_parts, pieces=body.pieces
+    )
     if not grid.cells.any():
+        finer = next((n for n in _FINER if n > body.resolution and voxelize(mesh.triangles, n).cells.any()), None)
         raise SceneError(
             f"{body.file}: no cell of the grid has its centre inside the model at resolution {body.resolution}; "
-            f"its parts are thinner than a cell of {grid.cell_size:.3g} m: raise the resolution"
+            + (f"resolution {finer} has some" if finer else "set keep_thin_parts to fill those it passes through")
         )
-    return grid.cells, grid.origin, grid.cell_size
+    for note in notes:
+        log.warning("%s: %s", body.file, note)
+    return grid.cells, grid.origin * body.scale, grid.cell_size * body.scale
 
 
 def _require_memory(needed: float, what: str) -> None:

@@ -292,6 +292,17 @@ class ModelBody(Body):
     particles_per_edge: int = Field(
         2, strict=True, ge=2, le=256, description="particles along an edge of each jelly cube"
     )
+    method: Literal["auto", "parity", "winding", "vote"] = Field(
+        "auto",
+        description="how cells are told to be inside: by an odd number of crossings of a ray; by the surface going "
+        "round them, for meshes that intersect themselves; or by three axes, for meshes with holes",
+    )
+    keep_thin_parts: Switch = Field(
+        False, description="fill the cells, too, that a part passes through which is thinner than a cell"
+    )
+    pieces: Literal["all", "largest"] = Field(
+        "all", description="of pieces that no face joins, keep each, moving by itself, or the largest alone"
+    )
 
     @field_validator("file", mode="after")
     @classmethod
