@@ -16,6 +16,7 @@ from typing import Any
 
 from warpjelly.scene import Scene
 from warpjelly.simulator import Simulator
+from warpjelly.softcontact import SoftContact
 
 ROUNDS = 75
 # How long each variant steps in a round, s.
@@ -56,6 +57,9 @@ def variants_of(culled: Simulator) -> list[Simulator]:
     free.model = dataclasses.replace(culled.model, colliders=nothing, skin=None)
     solver = culled.scene.solver.model_copy(update={"culling": False})
     full.scene = culled.scene.model_copy(update={"solver": solver})
+    if culled._soft is not None:
+        free._soft = None
+        full._soft = SoftContact(full.model, full.state, culling=False)
     for variant in (free, full):
         variant._graphs = {}
     return [free, culled, full]

@@ -265,6 +265,7 @@ def collider_bit(c: int):
 def add_contact_forces(
     # Model:
     mass: wp.array(dtype=Any),
+    inv_mass: wp.array(dtype=Any),
     chunk_start: wp.array(dtype=wp.int32),
     chunk_body: wp.array(dtype=wp.int32),
     colliders: Any,
@@ -278,6 +279,7 @@ def add_contact_forces(
     # In:
     dt: Any,
     loss_weight: Any,
+    ahead: Any,
     first: bool,
     culling: bool,
     lanes: int,
@@ -290,7 +292,8 @@ def add_contact_forces(
     """Add the contact forces, launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk.
 
     The first evaluation of a step remembers contacts; those of later stages look at trial positions only. Losses
-    [2, chunk_count] gain the power of contact damping and of friction times loss_weight.
+    [2, chunk_count] gain what contact damping and friction take, at the velocities that the forces make some time
+    ahead, times loss_weight.
     """
     chunk, lane = wp.tid()
     body = chunk_body[chunk]
@@ -314,6 +317,7 @@ def add_contact_forces(
         point = vectors.load(x, i)
         start = vectors.load(x_start, i)
         total = type(dt)(0.0) * point
+        damping = type(dt)(0.0) * point
         rubbing = type(dt)(0.0) * point
         touches = bool(False)
         for c in range(colliders.kind.shape[0]):
@@ -338,10 +342,14 @@ def add_contact_forces(
                     friction = friction_force(colliders, c, reaction, pressing, along, pull, mass[i], dt)
                     rubbing += friction
                     total += reaction * normal + friction
-                    damped -= wp.float64((reaction - colliders.stiffness[c] * counted) * speed)
-                    rubbed -= wp.float64(wp.dot(friction, velocity))
+                    damping += (reaction - colliders.stiffness[c] * counted) * normal
         # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
         if touches:
-            vectors.store(f, i, vectors.load(f, i) + total)
+            force = vectors.load(f, i) + total
+            vectors.store(f, i, force)
+            # Colliders come last, so that this is the whole force.
+            velocity = vectors.load(v, i) + ahead * inv_mass[i] * force
+            damped -= wp.float64(wp.dot(damping, velocity))
+            rubbed -= wp.float64(wp.dot(rubbing, velocity))
     wp.atomic_add(losses, 0, chunk, wp.float64(loss_weight) * damped)
     wp.atomic_add(losses, 1, chunk, wp.float64(loss_weight) * rubbed)

@@ -166,6 +166,7 @@ def add_pair_forces(
     # Model:
     skin: Any,
     mass: wp.array(dtype=Any),
+    inv_mass: wp.array(dtype=Any),
     # State in:
     near_lower: wp.array2d(dtype=Any),
     near_upper: wp.array2d(dtype=Any),
@@ -175,6 +176,7 @@ def add_pair_forces(
     # In:
     dt: Any,
     loss_weight: Any,
+    ahead: Any,
     culling: bool,
     # State out:
     f: wp.array2d(dtype=Any),
@@ -182,8 +184,9 @@ def add_pair_forces(
 ):
     """Add the forces on each particle of the skin, one thread each.
 
-    With culling, only particles near what their chunk may touch look for others. Losses [2, skin_count] gain each
-    particle's half of the power of damping and of friction times loss_weight.
+    With culling, only particles near what their chunk may touch look for others. Losses [2, skin_count] gain what
+    damping and friction take from each particle, at the velocity that the forces so far make some time ahead, times
+    loss_weight; only the sum over both particles of a pair is the same for who moves along.
     """
     a = wp.tid()
     point = points[a]
@@ -195,8 +198,8 @@ def add_pair_forces(
         return
     i = skin.particles[a]
     total = type(dt)(0.0) * point
-    damped = wp.float64(0.0)
-    rubbed = wp.float64(0.0)
+    damping = type(dt)(0.0) * point
+    rubbing = type(dt)(0.0) * point
     touches = bool(False)
     query = wp.hash_grid_query(grid, point, search)
     b = wp.int32(0)
@@ -215,15 +218,15 @@ def add_pair_forces(
                 total += force
                 normal = wp.normalize(offset)
                 push = wp.dot(force, normal)
-                speed = wp.dot(velocity, normal)
-                damped -= wp.float64((push - skin.stiffness * overlap) * speed)
-                rubbed -= wp.float64(wp.dot(force - push * normal, velocity))
+                damping += (push - skin.stiffness * overlap) * normal
+                rubbing += force - push * normal
     # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
     if touches:
-        half = wp.float64(0.5) * wp.float64(loss_weight)
-        vectors.store(f, i, vectors.load(f, i) + total)
-        losses[0, a] += half * damped
-        losses[1, a] += half * rubbed
+        so_far = vectors.load(f, i) + total
+        vectors.store(f, i, so_far)
+        velocity = vectors.load(v, i) + ahead * inv_mass[i] * so_far
+        losses[0, a] -= wp.float64(loss_weight) * wp.float64(wp.dot(damping, velocity))
+        losses[1, a] -= wp.float64(loss_weight) * wp.float64(wp.dot(rubbing, velocity))
 
 
 @wp.kernel

@@ -109,9 +109,10 @@ def push_fully(
         contacts.add_contact_forces,
         dim=(count, lanes),
         inputs=[
-            *(wp.full(len(x), mass, dtype=real, device=device), begin, body, model.colliders, lower, upper),
+            *(wp.full(len(x), each, dtype=real, device=device) for each in (mass, 1.0 / mass)),
+            *(begin, body, model.colliders, lower, upper),
             *(x_start, xs, vs, wp.full(1, step, dtype=wp.int64, device=device)),
-            *(real(simulator.dt), real(1.0), first, culling, lanes),
+            *(real(simulator.dt), real(1.0), real(0.0), first, culling, lanes),
         ],
         outputs=[*memory, f, losses],
         device=device,

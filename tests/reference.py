@@ -368,11 +368,12 @@ class World:
         ]
 
     def evaluate(
-        self, x: np.ndarray, v: np.ndarray, touches: list[list[Touch]], share: float = 0.0
+        self, x: np.ndarray, v: np.ndarray, touches: list[list[Touch]], share: float = 0.0, ahead: float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the total forces [count, 3], a share of a step on, and the powers [4], W.
 
-        Those are what springs, contacts and friction take and what fields give.
+        Those are what springs, contacts and friction take and what fields give; for contacts and friction at the
+        velocities that the forces make some time ahead.
         """
         elastic = spring_forces(x, v, self.ends, self.rest, self.k, 0 * self.d)
         springs = spring_forces(x, v, self.ends, self.rest, self.k, self.d)
@@ -380,16 +381,18 @@ class World:
         pushed = np.zeros_like(x)
         for field in self.scene.fields:
             pushed += field_force(field, x, v, self.charge, (self.steps + share) * self.dt)
-        applied, given = applied + pushed, np.zeros_like(x)
-        total, power = applied, np.array([-((springs - elastic) * v).sum(), 0.0, 0.0, (pushed * v).sum()])
+        applied, given, damping = applied + pushed, np.zeros_like(x), np.zeros_like(x)
+        total = applied
         for law, of_collider in zip(self.laws, touches, strict=True):
             for touch in of_collider:
                 if touch.here.any():
                     reaction, friction = contact_forces(law, touch, v, applied, self.m, self.dt, given)
                     stored = law["stiffness"] * np.where(touch.here, touch.counted, 0.0)[:, None] * touch.normal
                     total, given = total + reaction + friction, given + friction
-                    power -= [0.0, ((reaction - stored) * v).sum(), (friction * v).sum(), 0.0]
-        return total, power
+                    damping = damping + reaction - stored
+        u = v + ahead * total / self.m[:, None]
+        power = [((elastic - springs) * v).sum(), -(damping * u).sum(), -(given * u).sum(), (pushed * v).sum()]
+        return total, np.array(power)
 
     def forces(self) -> np.ndarray:
         """Return the total forces at the current state."""
@@ -409,7 +412,9 @@ class World:
             f, power = self.evaluate(x + dx, v + dv, self.find_touches(x + dx, x, now), share)
             return v + dv, f / self.m[:, None], power
 
-        f, power = self.evaluate(x, v, now)
+        # The mean velocity of a step by either Euler scheme, whose work is the change of kinetic energy.
+        euler = "euler" in self.scene.solver.integrator
+        f, power = self.evaluate(x, v, now, ahead=h / 2 if euler else 0.0)
         a = f / self.m[:, None]
         match self.scene.solver.integrator:
             case "explicit_euler":

@@ -191,7 +191,7 @@ def test_energy_account_closes_with_the_step(integrator: str, device: str) -> No
     assert np.abs(coarse).max() <= 0.02 * lost
     ratio = np.abs(coarse).max() / np.abs(fine).max()
     # Contacts begin and end within a step, and forces jump there: that is of first order by any scheme, though for
-    # Runge-Kutta schemes it is all there is, a thousandth of the others.
+    # Runge-Kutta schemes it is all there is, less than a hundredth of the others.
     if "euler" in integrator:
         assert ratio == pytest.approx(2, rel=0.1)
     else:

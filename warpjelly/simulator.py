@@ -366,14 +366,17 @@ class Simulator:
         return capture.graph
 
     def _substep(self) -> None:
+        # By an Euler step kinetic energy gains the work of the forces at the mean of old and new velocities.
+        middle = self.dt / 2.0
         if self.scene.solver.integrator == "semi_implicit_euler":
-            self._add_forces(loss_weight=self.dt)
+            self._add_forces(loss_weight=self.dt, ahead=middle)
             self._integrate(self.dt)
         else:
             stages = integrators.STAGES[self.scene.solver.integrator]
+            ahead = middle if len(stages) == 1 else 0.0
             for number, (share, weight, reach) in enumerate(stages):
                 first, last = number == 0, number == len(stages) - 1
-                self._add_forces(loss_weight=weight * self.dt, offset=share * self.dt, first=first)
+                self._add_forces(loss_weight=weight * self.dt, offset=share * self.dt, ahead=ahead, first=first)
                 self._integrate_stage(self.dt, weight, reach, first=first, last=last)
         self._launch(integrators.count_step, 1, [], [self.state.step])
 
@@ -396,13 +399,14 @@ class Simulator:
             [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
         )
 
-    def _add_forces(self, *, loss_weight: float, offset: float = 0.0, first: bool = True) -> None:
+    def _add_forces(self, *, loss_weight: float, offset: float = 0.0, ahead: float = 0.0, first: bool = True) -> None:
         """Overwrite the forces with those at the current positions and velocities.
 
         Args:
             loss_weight: what the power of dampers and friction counts for in the losses, and that of fields in their
                 work, s.
             offset: time since the start of the step, s.
+            ahead: losses of contact are taken at the velocities that the forces make in this time, s.
             first: whether this is the first evaluation of a step, which remembers contacts.
         """
         model, state = self.model, self.state
@@ -430,16 +434,16 @@ class Simulator:
         if (self._soft is not None and self._soft.culls) or (has_colliders and self.scene.solver.culling):
             self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], boxes)
         if self._soft is not None:
-            self._soft.add_forces(*boxes, dt=self.dt, loss_weight=loss_weight)
+            self._soft.add_forces(*boxes, dt=self.dt, loss_weight=loss_weight, ahead=ahead)
         if not has_colliders:
             return
         self._launch(
             contacts.add_contact_forces,
             (chunk_count, lanes),
             [
-                *(model.particle_mass, model.chunk_start, model.chunk_body, model.colliders),
+                *(model.particle_mass, model.particle_inv_mass, model.chunk_start, model.chunk_body, model.colliders),
                 *(*boxes, state.x_start, state.x, state.v, state.step),
-                *(model.real(self.dt), weight, first, self.scene.solver.culling, lanes),
+                *(model.real(self.dt), weight, model.real(ahead), first, self.scene.solver.culling, lanes),
             ],
             [state.stamps, state.normals, state.f, state.contact_losses],
         )

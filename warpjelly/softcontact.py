@@ -43,9 +43,9 @@ class SoftContact:
             self._energies = wp.zeros(len(self._points), dtype=wp.float64)
             self._overlaps = wp.zeros(len(self._points), dtype=wp.float64)
         # Kernels compile at their first launch, which must not be inside a capture.
-        self._search(dt=1.0, loss_weight=0.0)
+        self._search(dt=1.0, loss_weight=0.0, ahead=0.0)
 
-    def add_forces(self, lower: wp.array, upper: wp.array, *, dt: float, loss_weight: float) -> None:
+    def add_forces(self, lower: wp.array, upper: wp.array, *, dt: float, loss_weight: float, ahead: float) -> None:
         """Add the forces between particles to those of the state; without a search where no body is near another.
 
         Args:
@@ -53,9 +53,10 @@ class SoftContact:
             upper: their highest corners.
             dt: the time step, s.
             loss_weight: what the power of damping and friction counts for in the losses, s.
+            ahead: losses are taken at the velocities that the forces make in this time, s.
         """
         if not self.culls:
-            self._search(dt=dt, loss_weight=loss_weight)
+            self._search(dt=dt, loss_weight=loss_weight, ahead=ahead)
             return
         model, boxes, body_boxes = self._model, [lower, upper], [self._body_lower, self._body_upper]
         self._launch(bounds.update_body_bounds, len(model.bodies), [model.body_chunk_start, *boxes], body_boxes)
@@ -67,10 +68,10 @@ class SoftContact:
             [self._near_lower, self._near_upper, self._meetings],
         )
         if self._device.is_cpu:
-            wp.capture_if(self._meetings, self._search, dt=dt, loss_weight=loss_weight)
+            wp.capture_if(self._meetings, self._search, dt=dt, loss_weight=loss_weight, ahead=ahead)
         else:
             # A GPU would have to wait for the host to hear of the meetings.
-            self._search(dt=dt, loss_weight=loss_weight)
+            self._search(dt=dt, loss_weight=loss_weight, ahead=ahead)
 
     def measure(self) -> tuple[float, int, np.ndarray]:
         """Measure overlaps of particles.
@@ -95,7 +96,7 @@ class SoftContact:
         # Cells of two balls' width: fewer of them to search than of one, and hardly more balls.
         self._grid.build(self._points, 4.0 * self._skin.greatest_radius)
 
-    def _search(self, *, dt: float, loss_weight: float) -> None:
+    def _search(self, *, dt: float, loss_weight: float, ahead: float) -> None:
         """Add the forces between particles."""
         model, state = self._model, self._state
         self._build_grid()
@@ -103,9 +104,9 @@ class SoftContact:
             pairs.add_pair_forces,
             len(self._points),
             [
-                *(self._skin, model.particle_mass, self._near_lower, self._near_upper),
+                *(self._skin, model.particle_mass, model.particle_inv_mass, self._near_lower, self._near_upper),
                 *(wp.uint64(self._grid.id), self._points, state.v),
-                *(model.real(dt), model.real(loss_weight), self.culls),
+                *(model.real(dt), model.real(loss_weight), model.real(ahead), self.culls),
             ],
             [state.f, state.pair_losses],
         )
