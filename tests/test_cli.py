@@ -389,6 +389,42 @@ def test_a_body_that_starts_in_a_collider_is_warned_of(warpjelly, tmp_path):
     assert "warning: body 'cube' starts 0.2 m deep in a collider" in err
 
 
+def test_a_plane_that_faces_away_is_warned_of(warpjelly, tmp_path):
+    """Warn of a plane above whose back a body starts, but not of a shelf above a body."""
+    scene = tmp_path / "scene.toml"
+    found = {}
+    for height, normal in ((1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)):
+        lines = [
+            "[materials.jelly]",
+            "[[bodies]]",
+            'type = "cube"',
+            'material = "jelly"',
+            f"position = [0, {height}, 0]",
+        ]
+        lines += ["[[colliders]]", 'type = "plane"', f"normal = [0, {normal}, 0]", "size = [4.0, 4.0]"]
+        scene.write_text("\n".join(lines))
+        code, _, err = warpjelly("check", scene)
+        assert code == 0
+        found[height, normal] = "body 'cube_0' starts behind plane 'plane_0'" in err
+    assert found == {(1.0, -1.0): True, (1.0, 1.0): False, (-1.0, 1.0): False}
+
+
+def test_a_body_that_ends_inside_out_is_warned_of(warpjelly, tmp_path):
+    """Warn of a cube whose sides fly through each other, and not of one that is turned by half a turn."""
+    scene = tmp_path / "scene.toml"
+    for mirrored in (True, False):
+        positions = [[x - 0.5, y - 0.5, z - 0.5] for x in (0, 1) for y in (0, 1) for z in (0, 1)]
+        velocities = [[-6.0 * x, 0.0, 0.0 if mirrored else -6.0 * z] for x, _, z in positions]
+        lines = ["duration = 0.5", "gravity = [0, 0, 0]", "[materials.soft]"]
+        lines += [f"{kind} = {{stiffness = 0.001, damping = 0.0}}" for kind in ("structural", "shear", "bend")]
+        lines += ["[[bodies]]", 'type = "cube"', "particles_per_edge = 2", 'material = "soft"']
+        lines += [f"positions = {positions}", f"velocities = {velocities}"]
+        scene.write_text("\n".join(lines))
+        code, _, err = warpjelly("run", scene, "-o", tmp_path / f"out_{mirrored}")
+        assert code == 0
+        assert ("'cube_0': inside out at the end" in err) == mirrored
+
+
 def test_bodies_that_start_in_each_other_are_warned_of(warpjelly, tmp_path):
     """Warn of bodies nearer than a unit cell, with the overlap of their balls, and not of those a cell apart."""
     cube = ["[[bodies]]", 'type = "cube"', 'material = "jelly"', "particles_per_edge = 3"]

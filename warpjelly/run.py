@@ -7,11 +7,13 @@ import json
 import logging
 import platform
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from warpjelly.kernels.integrators import STAGES
 
@@ -140,6 +142,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
     finally:
         # Whatever happens, also what nobody foresaw: the frames that were finished are saved.
         writer.close()
+    _warn_of_inside_out(meshes, sim)
     stages = len(STAGES.get(scene.solver.integrator, [None]))
     forces = max(frames - 1, 0) * sim.substeps * stages
     observer.diverged = isinstance(ended, DivergedError)
@@ -251,3 +254,22 @@ def _warn_of_long_steps(sim: Simulator) -> None:
         return
     if broken := sim.broken_limit():
         log.warning("%s", broken)
+
+
+def _warn_of_inside_out(meshes: Sequence[SurfaceMesh], sim: Simulator) -> None:
+    names = [
+        mesh.body
+        for mesh, surface in zip(meshes, sim.surfaces(), strict=True)
+        if len(mesh.quads) and not mesh.double_sided and _is_mirrored(mesh.points, surface.points)
+    ]
+    if names:
+        log.warning(
+            "%s: inside out at the end; stiffer springs, a slower impact or a smaller step keep a body from it",
+            ", ".join(f"'{name}'" for name in names),
+        )
+
+
+def _is_mirrored(rest: np.ndarray, now: np.ndarray) -> bool:
+    """Say whether the linear map that best takes points [count, 3] to where they are now mirrors them."""
+    a, b = (points.astype(float) - points.mean(axis=0, dtype=float) for points in (rest, now))
+    return bool(np.isfinite(b).all() and np.linalg.det(np.linalg.lstsq(a, b)[0]) < 0.0)

@@ -121,6 +121,13 @@ def _explain(error: ValidationError) -> str:
     value = first["input"]
     key = _key(first["loc"])
     what = _WORDS.get(first["type"], first["msg"]).replace("Input should", "must").replace("Value should", "must")
+    if first["type"] == "too_long":
+        what = f"must have at most {context['max_length']} entries"
+    # Of a key that may be one of several things, all were tried.
+    tried = [problem for problem in problems[1:] if _key(problem["loc"]) == key]
+    if value is not None and not isinstance(value, Mapping):
+        for problem in tried:
+            what += ", or " + problem["msg"].removeprefix("Input should be ")
     if first["type"] == "list_type" and first["loc"][-1] in ("bodies", "colliders", "fields", "pinned"):
         header = ".".join(part for part in key.split(".") if not part.isdigit())
         what += f"; its tables are headed [[{header}]], with two brackets"
@@ -128,6 +135,11 @@ def _explain(error: ValidationError) -> str:
         key = ".".join(filter(None, [key, context["key"]]))
     if first["type"] == "unknown_key":
         message = f"{key}: unknown key; {what}"
+    elif first["type"] == "missing" and isinstance(first["loc"][-1], int):
+        *parents, _ = first["loc"]
+        lacking = sum(problem["type"] == "missing" and list(problem["loc"][:-1]) == parents for problem in problems)
+        needed = f"must have {len(value) + lacking} entries, not {len(value)}"
+        return f"{_key(tuple(parents))} = {_shown(value)}: {needed}{_described(tuple(parents))}"
     elif first["type"] == "missing":
         message = f"{key}: missing; this key is required{_described(first['loc'])}"
     elif first["type"] == "union_tag_not_found":
@@ -140,7 +152,8 @@ def _explain(error: ValidationError) -> str:
         message = f"{key}: {what}"
     else:
         message = f"{key} = {_shown(value)}: {what}{_described(first['loc'])}"
-    return message + (f" (and {len(problems) - 1} more)" if len(problems) > 1 else "")
+    others = len(problems) - 1 - len(tried)
+    return message + (f" (and {others} more)" if others else "")
 
 
 def _key(location: tuple[int | str, ...]) -> str:

@@ -198,18 +198,21 @@ class Simulator:
             if limit is None:
                 return f"{name} has no stable step {where}, whatever solver.dt"
             if self.dt > limit:
-                return f"the time step of {self.dt:.4g} s is above the largest stable one {where}, {limit:.4g} s"
+                return (
+                    f"the time step of {self.dt:.4g} s is above the largest stable one {where}, {limit:.4g} s: lower "
+                    "solver.dt"
+                )
         bounce = bounce_limits(contact_pairs(self.model))[name]
         if bounce is not None and self.dt > bounce:
             return (
                 f"with the time step of {self.dt:.4g} s bounces may gain energy: it is above {BOUNCE_SHARE:g} of what "
-                f"contact alone allows a particle; at most {bounce:.4g} s is safe"
+                f"contact alone allows a particle; lower solver.dt to {bounce:.4g} s"
             )
         magnetic = magnetic_limits(self.model, self._duration)[name]
         if self.dt > magnetic:
             return (
                 f"with the time step of {self.dt:.4g} s magnetic fields add more than {MAGNETIC_GAIN:.0%} of energy to "
-                f"what they turn; at most {magnetic:.4g} s is safe"
+                f"what they turn; lower solver.dt to {magnetic:.4g} s"
             )
         return None
 
