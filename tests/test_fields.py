@@ -137,7 +137,7 @@ def test_a_grid_is_read_from_numpy_files(tmp_path, device: str) -> None:
     [
         ({"fields.0.forces": [[1.0, 2.0, 3.0]] * 9}, "[R^3, 3] with R at least 2"),
         ({"fields.0.forces": [[1.0, 2.0, 3.0]]}, "[R^3, 3] with R at least 2"),
-        ({"fields.0.forces": [[1.0, 2.0]] * 8}, "fields.0.forces.0.2: missing"),
+        ({"fields.0.forces": [[1.0, 2.0]] * 8}, "fields.0.forces.0 = [1.0, 2.0]: must have 3 entries, not 2"),
         ({"fields.0.forces": [[float("nan"), 2.0, 0.0]] * 8}, "finite"),
         ({"fields.0.forces": None}, "give either forces or file"),
         ({"fields.0.file": "none.npy"}, "no such file"),
