@@ -14,9 +14,11 @@ from world_files import WORLDS
 
 import warpjelly as wj
 from warpjelly import cli, plan
+from warpjelly.scene import Scene
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CUBE = str(SCENES / "jello_cube.toml")
+TREE = SCENES / "models" / "tree.obj"
 
 MODEL_SCENE = """
 [materials.m]
@@ -387,6 +389,79 @@ def test_a_body_that_starts_in_a_collider_is_warned_of(warpjelly, tmp_path):
     code, _, err = warpjelly("run", CUBE, *arguments, "--set", "bodies.cube.rotation=[0.0, 0.0, 0.0]")
     assert code == 0
     assert "warning: body 'cube' starts 0.2 m deep in a collider" in err
+
+
+def test_voxelize_says_what_a_model_becomes(warpjelly, tmp_path):
+    """Report figures of a model, and write a grid that makes the same body as the model."""
+    grid = tmp_path / "tree.npz"
+    code, out, err = warpjelly("voxelize", TREE, "--resolution", 12, "-o", grid, "--json")
+    assert (code, err) == (0, "")
+    figures = json.loads(out)
+    assert list(figures) == [
+        *("voxels", "particles", "springs", "pieces", "watertight", "method", "volume", "mesh_volume", "warnings")
+    ]
+    assert (figures["pieces"], figures["watertight"], figures["method"], figures["warnings"]) == (1, True, "parity", [])
+    # The faces of the tree lie between cells at this resolution; the file keeps six decimals.
+    assert figures["volume"] == pytest.approx(figures["mesh_volume"], rel=1e-4)
+    bodies = [
+        {"type": "model", "file": str(TREE), "resolution": 12, "material": "jelly"},
+        {"type": "voxels", "file": str(grid), "material": "jelly"},
+        {"type": "voxels", "file": str(grid), "cell_size": 1 / 6, "material": "jelly"},
+    ]
+    of_model, of_grid, twice = (
+        wj.Simulator(Scene.model_validate({"materials": {"jelly": {}}, "bodies": [body]}), device="cpu")
+        for body in bodies
+    )
+    assert len(of_model.positions) == figures["particles"]
+    assert of_model.model.spring_count == figures["springs"]
+    np.testing.assert_array_equal(of_grid.positions, of_model.positions)
+    # A float32 each.
+    np.testing.assert_allclose(twice.positions, 2 * of_model.positions, rtol=0, atol=1e-6)
+    code, out, err = warpjelly("voxelize", TREE, "-n", 12, "-o", grid)
+    assert (code, out) == (2, "")
+    assert "there already" in one_line(err)
+    code, out, _ = warpjelly("voxelize", TREE, "-n", 12, "-o", grid, "--force")
+    assert code == 0
+    assert f"voxels     {figures['voxels']:>13,} of 8 x 12 x 8" in out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["nothing.obj", "-n", 4], "nothing.obj: no such file"),
+        ([TREE, "-n", 4, "-o", "grid.obj"], "grid.obj: a grid is written as .npz"),
+        ([TREE, "-n", 0], "--resolution"),
+        ([TREE, "-n", 4, "-o", "nowhere/grid.npz"], "nowhere/grid.npz: cannot write the grid"),
+    ],
+)
+def test_voxelize_refuses_in_one_line(warpjelly, tmp_path, monkeypatch, arguments, said):
+    """Refuse what is no model, no resolution or no place for a grid."""
+    monkeypatch.chdir(tmp_path)
+    code, out, err = warpjelly("voxelize", *arguments)
+    assert (code, out) == (4 if "nowhere" in said else 2, "")
+    assert said in err
+
+
+@pytest.mark.parametrize(
+    ("arrays", "said"),
+    [
+        ({"cells": np.zeros((2, 2, 2), bool)}, "one of them occupied"),
+        ({"cells": np.ones((2, 2), bool)}, "cells must be [x, y, z]"),
+        ({"other": np.ones((2, 2, 2), bool)}, "cells"),
+        ({"cells": np.ones((1, 1, 1), bool), "cell_size": np.nan}, "must be lengths"),
+        ({"cells": np.ones((1, 1, 1), bool), "origin": [0.0, np.inf, 0.0]}, "must be lengths"),
+        ({"cells": np.ones((1, 1, 1), bool), "origin": [0.0, 0.0]}, "must be lengths"),
+    ],
+)
+def test_a_broken_grid_is_refused_in_one_line(warpjelly, tmp_path, arrays, said):
+    """Refuse files of grids without cells, or with places and sizes that cannot be."""
+    np.savez(tmp_path / "grid.npz", **arrays)
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[materials.jelly]\n[[bodies]]\ntype = "voxels"\nmaterial = "jelly"\nfile = "grid.npz"\n')
+    code, out, err = warpjelly("check", scene)
+    assert (code, out) == (2, "")
+    assert said in one_line(err)
+    assert "grid.npz" in err
 
 
 def test_a_plane_that_faces_away_is_warned_of(warpjelly, tmp_path):

@@ -160,6 +160,62 @@ def check(
 
 
 @app.command()
+def voxelize(
+    model: Annotated[Path, typer.Argument(help="Mesh file.", show_default=False)],
+    resolution: Annotated[
+        int, typer.Option("--resolution", "-n", min=1, max=4096, help="Jelly cubes along the longest edge.")
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Grid to write, .npz, for `file` of a body of voxels.", show_default=False),
+    ] = None,
+    method: Annotated[
+        Literal["auto", "parity", "winding", "vote"], typer.Option(help="How cells are told to be inside.")
+    ] = "auto",
+    keep_thin_parts: Annotated[
+        bool, typer.Option("--keep-thin-parts", help="Fill, too, what parts thinner than a cell pass through.")
+    ] = False,
+    pieces: Annotated[
+        Literal["all", "largest"], typer.Option(help="Of pieces that no face joins, keep each or one.")
+    ] = "all",
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Say what a model becomes: voxels, particles, springs, volume, and what is wrong with it."""
+    if not model.is_file():
+        raise InputError(f"{model}: no such file")
+    if output is not None and output.suffix.lower() != ".npz":
+        raise InputError(f"{output}: a grid is written as .npz")
+    if output is not None and output.exists() and not force:
+        raise InputError(f"{output}: there already; choose another name, or replace it with --force")
+
+    from .plan import survey_model
+    from .scenefile import read_scene
+
+    options = {"method": method, "keep_thin_parts": keep_thin_parts, "pieces": pieces}
+    body = {"type": "model", "name": "model", "material": "jelly", "file": str(model.absolute()), **options}
+    scene = read_scene({"materials": {"jelly": {}}, "bodies": [{**body, "resolution": resolution}]}, model)
+    grid, figures = survey_model(scene)
+    if output is not None:
+        from .voxelize import save_grid
+
+        save_grid(grid, output)
+    if as_json:
+        print(json.dumps(figures))
+        return
+    closed = "watertight" if figures["watertight"] else "not watertight"
+    share = f", {figures['volume'] / figures['mesh_volume']:.1%} of the mesh's" if figures["mesh_volume"] else ""
+    print(f"{model}: {closed}, method {figures['method']}")
+    print(f"  voxels     {figures['voxels']:>13,} of {' x '.join(map(str, grid.cells.shape))}")
+    print(f"  pieces     {figures['pieces']:>13,}")
+    print(f"  particles  {figures['particles']:>13,}")
+    print(f"  springs    {figures['springs']:>13,}")
+    print(f"  volume     {figures['volume']:>13.4g} m^3{share}")
+    if output is not None:
+        print(f"grid: {output}")
+
+
+@app.command()
 def validate(
     stage: Annotated[Path, typer.Argument(help="Stage file or run directory.", show_default=False)],
 ) -> None:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
 from .network import build_cloth, build_network
 from .scene import MAX_LENGTH, MIN_LENGTH, AnyBody, ClothBody, CubeBody, ModelBody, NetworkBody, Scene
+
+if TYPE_CHECKING:
+    from .voxelize import VoxelGrid
 
 log = logging.getLogger("warpjelly")
 
@@ -116,10 +120,10 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
     elif isinstance(body, ModelBody):
-        cells, origin, cell_size = _voxelize_model(body)
+        grid = voxelize_model(body).grid
+        cells, origin, cell_size = grid.cells, grid.origin, grid.cell_size
     else:
-        cells, cell_size = body.grid(), body.cell_size
-        origin = -np.array(cells.shape) * cell_size / 2
+        cells, origin, cell_size = body.grid()
     per_edge = body.particles_per_edge
     build = partial(
         build_lattice,
@@ -133,7 +137,25 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
     return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size)
 
 
-def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
+@dataclass(frozen=True)
+class VoxelizedModel:
+    """What became of a model."""
+
+    grid: VoxelGrid
+    """In metres."""
+    watertight: bool
+    mesh_volume: float
+    """m^3; of a closed mesh that does not intersect itself, the volume inside."""
+    warnings: list[str]
+    """What the user should know, a sentence each; they have been logged, too."""
+
+
+def voxelize_model(body: ModelBody) -> VoxelizedModel:
+    """Read and voxelize the model of a body.
+
+    Raises:
+        InputError: the model cannot be used.
+    """
     # These imports take most of a second, which scenes without models need not spend.
     from .meshes import load_mesh
     from .voxelize import voxelize, voxelize_mesh
@@ -161,7 +183,34 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
         )
     for note in notes:
         log.warning("%s: %s", body.file, note)
-    return grid.cells, grid.origin * body.scale, grid.cell_size * body.scale
+    in_metres = replace(grid, origin=grid.origin * body.scale, cell_size=grid.cell_size * body.scale)
+    return VoxelizedModel(in_metres, bool(mesh.is_watertight), float(abs(mesh.volume)) * body.scale**3, notes)
+
+
+def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
+    """Return the grid of a scene's only body, a model, and what becomes of it by name; SI units.
+
+    Raises:
+        InputError: the model cannot be used.
+    """
+    from .voxelize import find_pieces
+
+    (body,) = scene.bodies
+    assert isinstance(body, ModelBody)
+    model = voxelize_model(body)
+    grid = model.grid
+    lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
+    return grid, {
+        "voxels": int(np.count_nonzero(grid.cells)),
+        "particles": len(lattice.particles),
+        "springs": lattice.spring_count,
+        "pieces": len(find_pieces(grid.cells)[1]),
+        "watertight": model.watertight,
+        "method": grid.method,
+        "volume": grid.volume,
+        "mesh_volume": model.mesh_volume,
+        "warnings": model.warnings,
+    }
 
 
 def _require_memory(needed: float, what: str) -> None:

@@ -237,23 +237,35 @@ class CubeBody(Body):
         return self
 
 
+# Edge of the jelly cubes of a grid, m.
+DEFAULT_CELL_SIZE = 0.1
+
+
 class VoxelsBody(Body):
-    """Jelly cubes on a grid drawn in the scene; the origin is the centre of the grid."""
+    """Jelly cubes on a grid, drawn in the scene around the origin, or from a file."""
 
     type: Literal["voxels"]
-    layers: list[list[str]] = Field(
+    layers: list[list[str]] | None = Field(
+        None,
         min_length=1,
         description="layers along +y from the bottom up; each a list of rows along +z; each row a string along +x "
         "with # for a jelly cube and . for none",
     )
-    cell_size: Length = Field(0.1, description="edge of one jelly cube, m")
+    file: Path | None = Field(
+        None,
+        description="instead of layers an .npz file, relative to the scene file: cells [x, y, z], and maybe origin, "
+        "the lowest corner, and cell_size; `warpjelly voxelize` writes such files",
+    )
+    cell_size: Length | None = Field(None, description="edge of one jelly cube, m; 0.1 unless a file has its own")
     particles_per_edge: int = Field(
         2, strict=True, ge=2, le=256, description="particles along an edge of each jelly cube"
     )
 
     @field_validator("layers")
     @classmethod
-    def _layers_form_a_grid(cls, layers: list[list[str]]) -> list[list[str]]:
+    def _layers_form_a_grid(cls, layers: list[list[str]] | None) -> list[list[str]] | None:
+        if layers is None:
+            return None
         rows, width = len(layers[0]), len(layers[0][0]) if layers[0] else 0
         for y, layer in enumerate(layers):
             if len(layer) != rows:
@@ -268,10 +280,46 @@ class VoxelsBody(Body):
             raise PydanticCustomError("layers", "the grid has no jelly cube (#)")
         return layers
 
-    def grid(self) -> np.ndarray:
-        """Return the occupied cells, bool [x, y, z]."""
-        filled = np.array([[[c == "#" for c in row] for row in layer] for layer in self.layers])
-        return np.ascontiguousarray(filled.transpose(2, 0, 1))
+    @field_validator("file", mode="after")
+    @classmethod
+    def _file_is_relative_to_the_scene(cls, file: Path | None, info: ValidationInfo) -> Path | None:
+        return None if file is None else _existing(file, info)
+
+    @model_validator(mode="after")
+    def _there_is_one_grid(self) -> Self:
+        if (self.layers is None) == (self.file is None):
+            raise PydanticCustomError("layers", "give either layers or file")
+        if self.file is not None:
+            self.grid()
+        return self
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Return the occupied cells, bool [x, y, z]; the lowest corner of the grid, [3], m; the edge of a cell, m."""
+        if self.file is not None:
+            return _read_grid(self.file, self.cell_size)
+        filled = np.array([[[c == "#" for c in row] for row in layer] for layer in self.layers or []])
+        cells = np.ascontiguousarray(filled.transpose(2, 0, 1))
+        cell_size = DEFAULT_CELL_SIZE if self.cell_size is None else self.cell_size
+        return cells, -np.array(cells.shape) * cell_size / 2, cell_size
+
+
+def _read_grid(file: Path, cell_size: float | None) -> tuple[np.ndarray, np.ndarray, float]:
+    """Read the cells, the origin and the cell size of an .npz file; a given cell size scales all of it."""
+    try:
+        with np.load(file, allow_pickle=False) as data:
+            cells = data["cells"] != 0
+            own = float(data["cell_size"]) if "cell_size" in data else DEFAULT_CELL_SIZE
+            origin = data["origin"].astype(float) if "origin" in data else -np.array(cells.shape) * own / 2
+        if cells.ndim != 3 or not cells.any():
+            raise ValueError(f"cells must be [x, y, z] with one of them occupied, not {list(cells.shape)}")
+        if not MIN_LENGTH <= own <= MAX_LENGTH or origin.shape != (3,) or not np.abs(origin).max() <= MAX_LENGTH:
+            raise ValueError(f"origin and cell_size must be lengths in m, not {origin.tolist()} and {own}")
+    # NumPy raises whatever its parsing happens to trip over; all of it means that the file is broken.
+    except Exception as error:
+        what = {"file": str(file), "why": str(error) or type(error).__name__}
+        raise PydanticCustomError("grid", "{file}: not a grid of voxels: {why}", what) from error
+    scale = 1.0 if cell_size is None else cell_size / own
+    return cells, scale * origin, scale * own
 
 
 def _existing(file: Path, info: ValidationInfo) -> Path:

@@ -42,6 +42,19 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         data["frames"] = frames
         data.pop("expect", None)
     data.setdefault("name", _identifier(path.stem))
+    return read_scene(data, path)
+
+
+def read_scene(data: dict[str, Any], path: Path) -> Scene:
+    """Validate the tables of a scene.
+
+    Args:
+        data: tables and values by key, as from a scene file.
+        path: the file that errors name, and that relative paths are relative to.
+
+    Raises:
+        InputError: as for ``load_scene``.
+    """
     try:
         return Scene.model_validate(data, context={"folder": path.parent})
     except ValidationError as error:

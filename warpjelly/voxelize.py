@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,8 @@ import warp as wp
 from warpjelly.kernels import voxels
 
 from .device import start_warp
+from .errors import EnvironmentFailedError
+from .files import whole_file
 
 # How cells are told to be inside, by the crossings of a ray from their centres: an odd number; a winding number that is
 # not 0; the majority of odd numbers along three axes.
@@ -95,6 +98,19 @@ def voxelize_mesh(
         if pieces == "largest":
             grid = keep_largest_piece(grid)
     return grid, notes
+
+
+def save_grid(grid: VoxelGrid, path: Path) -> None:
+    """Write cells, origin and cell size of a grid to an .npz file, which a body of voxels can use.
+
+    Raises:
+        EnvironmentFailedError: the file cannot be written.
+    """
+    try:
+        with whole_file(path) as unfinished:
+            np.savez_compressed(unfinished, cells=grid.cells, origin=grid.origin, cell_size=grid.cell_size)
+    except OSError as error:
+        raise EnvironmentFailedError(f"{path}: cannot write the grid: {error.strerror or error}") from error
 
 
 def choose_method(triangles: np.ndarray, *, closed: bool, device: str = "cpu") -> tuple[str, list[str]]:
