@@ -312,9 +312,7 @@ class World:
         xs, vs, ms, bodies, springs, self.starts = [], [], [], [], [], []
         first = 0
         for number, body in enumerate(scene.bodies):
-            cells, edge = (
-                (np.ones((1, 1, 1), bool), body.size) if body.type == "cube" else (body.grid(), body.cell_size)
-            )
+            cells, edge = (np.ones((1, 1, 1), bool), body.size) if body.type == "cube" else body.grid()[::2]
             lattice, unit = build(cells, body.particles_per_edge), edge / (body.particles_per_edge - 1)
             material = scene.materials[body.material]
             rest_shape = unit * np.array([key[0] for key in lattice.keys]) - edge * np.array(cells.shape) / 2

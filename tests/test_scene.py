@@ -167,8 +167,10 @@ def test_a_bad_grid_is_refused(scene_file, layers, said):
 def test_a_grid_has_its_axes_where_the_documentation_says():
     """Read layers upwards, rows towards the viewer, columns to the right."""
     body = VoxelsBody(type="voxels", material="jelly", layers=[["#..", "..."], ["...", "..#"]])
-    assert body.grid().shape == (3, 2, 2)
-    assert {tuple(int(i) for i in cell) for cell in np.argwhere(body.grid())} == {(0, 0, 0), (2, 1, 1)}
+    cells, origin, cell_size = body.grid()
+    assert cells.shape == (3, 2, 2)
+    assert (origin.tolist(), cell_size) == ([-0.15000000000000002, -0.1, -0.1], 0.1)
+    assert {tuple(int(i) for i in cell) for cell in np.argwhere(cells)} == {(0, 0, 0), (2, 1, 1)}
 
 
 @pytest.mark.parametrize("text", ["a = [", "a = 1\na = 2", "= 3", "a = " + 3000 * "[" + 3000 * "]"])

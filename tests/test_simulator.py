@@ -243,7 +243,7 @@ def test_mirrored_scene_gives_the_mirrored_result(axis: int, device: str) -> Non
     mirrored = {**plain, "gravity": (sign * GRAVITY).tolist()}
     mirrored["colliders"] = [mirror(collider) for collider in plain["colliders"]]
     mirrored["bodies"] = [mirror(body) for body in plain["bodies"]]
-    grid = make_scene(**plain).bodies[0].grid()
+    grid, *_ = make_scene(**plain).bodies[0].grid()
     mirrored["bodies"][0]["layers"] = make_voxels(np.flip(grid, axis))["layers"]
     scenes = make_scene(**plain), make_scene(**mirrored)
 

@@ -184,7 +184,9 @@ def voxelize_model(body: ModelBody) -> VoxelizedModel:
     for note in notes:
         log.warning("%s: %s", body.file, note)
     in_metres = replace(grid, origin=grid.origin * body.scale, cell_size=grid.cell_size * body.scale)
-    return VoxelizedModel(in_metres, bool(mesh.is_watertight), float(abs(mesh.volume)) * body.scale**3, notes)
+    # By the divergence theorem.
+    volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6 * body.scale**3
+    return VoxelizedModel(in_metres, bool(mesh.is_watertight), volume, notes)
 
 
 def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
