@@ -116,7 +116,7 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
     elif isinstance(body, ModelBody):
-        cells, origin, cell_size = _voxelize_model(body)
+        cells, origin, cell_size = _voxelize_model(body, scene.up_axis)
     else:
         cells, cell_size = body.grid(), body.cell_size
         origin = -np.array(cells.shape) * cell_size / 2
@@ -133,17 +133,20 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
     return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size)
 
 
-def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
+def _voxelize_model(body: ModelBody, up_axis: str) -> tuple[np.ndarray, np.ndarray, float]:
     # These imports take most of a second, which scenes without models need not spend.
     from .meshes import load_mesh
     from .voxelize import voxelize, voxelize_mesh
 
-    mesh = load_mesh(body.file)
-    largest = mesh.extents.max() * body.scale
+    mesh = load_mesh(body.file, up_axis=up_axis, prim=body.prim)
+    scale = 1.0 if body.scale is None else body.scale
+    if body.fit is not None:
+        mesh.vertices *= body.fit / mesh.extents.max()
+    largest = mesh.extents.max() * scale
     if not MIN_LENGTH <= largest <= MAX_LENGTH:
         raise SceneError(
             f"{body.file}: the model is {largest:.3g} m large; between {MIN_LENGTH:g} and {MAX_LENGTH:g} m can be "
-            f"simulated: change bodies.{body.name}.scale"
+            f"simulated: change bodies.{body.name}.scale or set fit"
         )
     sides = np.ceil(mesh.extents / mesh.extents.max() * body.resolution).astype(int)
     cell_count = int(np.prod(np.maximum(sides, 1).astype(object)))
@@ -161,7 +164,7 @@ def _voxelize_model(body: ModelBody) -> tuple[np.ndarray, np.ndarray, float]:
         )
     for note in notes:
         log.warning("%s: %s", body.file, note)
-    return grid.cells, grid.origin * body.scale, grid.cell_size * body.scale
+    return grid.cells, grid.origin * scale, grid.cell_size * scale
 
 
 def _require_memory(needed: float, what: str) -> None:
