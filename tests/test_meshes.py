@@ -471,6 +471,7 @@ def Mesh "m"
          "property float z\nend_header\n1 2 3\n", "no triangles"),
         ("short.ply", "ply\nformat binary_little_endian 1.0\nelement vertex 9\nproperty float x\nend_header\n1234",
          "ends too early"),
+        ("draco.gltf", '{"extensionsRequired": ["KHR_draco_mesh_compression"]}', "KHR_draco_mesh_compression; save it"),
         ("format.ply", "ply\nformat strange 1.0\nend_header\n", "its format is unknown"),
     ],
 )  # fmt: skip

@@ -6,6 +6,7 @@ their unit and have Z up, glTF is in metres with Y up. OBJ, STL, PLY and OFF say
 
 from __future__ import annotations
 
+import json
 from importlib import util
 from pathlib import Path
 
@@ -30,6 +31,8 @@ _METERS_PER_3MF_UNIT = {
     "foot": 0.3048,
     "meter": 1.0,
 }
+# Extensions of glTF without which its coordinates mean something else.
+_GLTF_COMPRESSION = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"}
 # Rotations that turn one axis, pointing up, into another. What is to the right with X up is at -Y.
 _TURNS = {
     ("X", "Y"): [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
@@ -85,6 +88,8 @@ def _read(path: Path, kind: str, prim: str | None) -> Model:
         return Model([_POLYGON_READERS[kind](path)])
     if kind == ".dae":
         return _read_dae(path)
+    if kind in (".glb", ".gltf"):
+        _refuse_compressed(path)
     # Meshes are placed by the nodes of a scene, some of them more than once.
     scene = trimesh.load_scene(path, process=False)
     parts = []
@@ -98,6 +103,21 @@ def _read(path: Path, kind: str, prim: str | None) -> Model:
         unit = str(scene.metadata["units"]).replace("millimeters", "millimeter")
         return Model(parts, _METERS_PER_3MF_UNIT[unit], "Z")
     return Model(parts, up_axis="Y" if kind in (".glb", ".gltf") else "")
+
+
+def _refuse_compressed(path: Path) -> None:
+    """Refuse glTF files whose meshes are compressed, which would be read as something else.
+
+    Raises:
+        ValueError: they are, or the file is no glTF.
+    """
+    data = path.read_bytes()
+    if data.startswith(b"glTF"):
+        # The header and the length and type of the first chunk, which is the text.
+        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
+    needed = _GLTF_COMPRESSION.intersection(json.loads(data).get("extensionsRequired", []))
+    if needed:
+        raise ValueError(f"its meshes are compressed with {min(needed)}; save it without")
 
 
 def _joined(path: Path, model: Model, up_axis: str) -> trimesh.Trimesh:

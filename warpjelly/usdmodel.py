@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdUtils
 
-from .errors import SceneError
+from .errors import SceneError, reason
 from .polygons import Model, Part, from_polygons, placed
-from .usd import reason
 
 log = logging.getLogger("warpjelly")
 
