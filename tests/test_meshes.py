@@ -510,6 +510,27 @@ def test_a_file_that_is_cut_short_is_refused(tmp_path: Path, kind: str, write: C
             load_mesh(file)
 
 
+@pytest.mark.parametrize("count", [4, 5, 8, 40, 300])
+@pytest.mark.parametrize("seed", range(4))
+def test_polygons_are_cut_into_triangles_inside(count: int, seed: int) -> None:
+    """Cut spiky polygons of any orientation in space into triangles that all turn the same way and fill them."""
+    generator = np.random.default_rng(seed)
+    angles = np.sort(generator.uniform(0, 2 * np.pi, count))
+    outline = generator.uniform(0.2, 1.0, (count, 1)) * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    normal = generator.normal(size=3)
+    across = np.linalg.svd(normal[None])[2][1:]
+    points = outline @ across
+    triangles = triangulate(points, np.array([count]), np.arange(count))
+    assert len(triangles) == count - 2
+    a, b, c = np.moveaxis(points[triangles], 1, 0)
+    areas = np.cross(b - a, c - a) @ np.cross(*across) / 2
+    ahead = np.roll(outline, -1, axis=0)
+    area = (outline[:, 0] * ahead[:, 1] - outline[:, 1] * ahead[:, 0]).sum() / 2
+    # Triangles as thin as rounding may turn either way.
+    assert areas.min() > -1e-15
+    assert areas.sum() == pytest.approx(area, rel=1e-12)
+
+
 def model_scene(tmp_path: Path, **keys: object) -> wj.Scene:
     """Return a scene with one model."""
     body = {"type": "model", "material": "m", "resolution": 8, **keys}
