@@ -294,8 +294,8 @@ def doctor() -> None:
         print("  no CUDA device; simulations run on the CPU")
     print(f"kernel cache: {wp.config.kernel_cache_dir}")
     print("optional parts:")
-    for extra, module in [("preview", "pyvista")]:
-        missing = "" if util.find_spec(module) else f"missing: pip install 'warpjelly[{extra}]'"
+    for extra, modules in [("preview", ["pyvista"]), ("formats", ["lxml", "networkx", "collada"])]:
+        missing = "" if all(map(util.find_spec, modules)) else f"missing: pip install 'warpjelly[{extra}]'"
         print(f"  {extra:<10} {missing or 'present'}")
 
 

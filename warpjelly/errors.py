@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 
 class WarpjellyError(Exception):
     """Base of every error that warpjelly raises on purpose; the message is one line for people."""
@@ -29,3 +31,9 @@ class EnvironmentFailedError(WarpjellyError):
     """The machine said no: a full disk, a missing permission, a lost device."""
 
     exit_code = 4
+
+
+def reason(error: Exception) -> str:
+    """Return what an error of USD says first, without the place in USD's source that reports it."""
+    said = re.search(r" : '(.*?)'\s*$", str(error), re.MULTILINE)
+    return said[1] if said else " ".join(str(error).split())

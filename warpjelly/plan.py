@@ -120,7 +120,7 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
     elif isinstance(body, ModelBody):
-        grid = voxelize_model(body).grid
+        grid = voxelize_model(body, up_axis=scene.up_axis).grid
         cells, origin, cell_size = grid.cells, grid.origin, grid.cell_size
     else:
         cells, origin, cell_size = body.grid()
@@ -150,8 +150,12 @@ class VoxelizedModel:
     """What the user should know, a sentence each; they have been logged, too."""
 
 
-def voxelize_model(body: ModelBody) -> VoxelizedModel:
+def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     """Read and voxelize the model of a body.
+
+    Args:
+        body: names the file, and how to voxelize it.
+        up_axis: Y or Z; a model that says which axis points up is turned so that this one does.
 
     Raises:
         InputError: the model cannot be used.
@@ -160,12 +164,15 @@ def voxelize_model(body: ModelBody) -> VoxelizedModel:
     from .meshes import load_mesh
     from .voxelize import voxelize, voxelize_mesh
 
-    mesh = load_mesh(body.file)
-    largest = mesh.extents.max() * body.scale
+    mesh = load_mesh(body.file, up_axis=up_axis, prim=body.prim)
+    scale = 1.0 if body.scale is None else body.scale
+    if body.fit is not None:
+        mesh.vertices *= body.fit / mesh.extents.max()
+    largest = mesh.extents.max() * scale
     if not MIN_LENGTH <= largest <= MAX_LENGTH:
         raise SceneError(
             f"{body.file}: the model is {largest:.3g} m large; between {MIN_LENGTH:g} and {MAX_LENGTH:g} m can be "
-            f"simulated: change bodies.{body.name}.scale"
+            f"simulated: change bodies.{body.name}.scale or set fit"
         )
     sides = np.ceil(mesh.extents / mesh.extents.max() * body.resolution).astype(int)
     cell_count = int(np.prod(np.maximum(sides, 1).astype(object)))
@@ -183,9 +190,9 @@ def voxelize_model(body: ModelBody) -> VoxelizedModel:
         )
     for note in notes:
         log.warning("%s: %s", body.file, note)
-    in_metres = replace(grid, origin=grid.origin * body.scale, cell_size=grid.cell_size * body.scale)
+    in_metres = replace(grid, origin=grid.origin * scale, cell_size=grid.cell_size * scale)
     # By the divergence theorem.
-    volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6 * body.scale**3
+    volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6 * scale**3
     return VoxelizedModel(in_metres, bool(mesh.is_watertight), volume, notes)
 
 
@@ -199,7 +206,7 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
 
     (body,) = scene.bodies
     assert isinstance(body, ModelBody)
-    model = voxelize_model(body)
+    model = voxelize_model(body, up_axis=scene.up_axis)
     grid = model.grid
     lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
     return grid, {

@@ -47,6 +47,8 @@ MAX_SUBSTEPS = 1_000_000
 MIN_STEP, MAX_STEP = 1e-9, 1.0
 # Samples per second beyond these as well.
 MIN_FPS, MAX_FPS = 0.1, 1e9
+# Model files whose meshes are found by prim.
+USD_EXTENSIONS = (".usd", ".usda", ".usdc", ".usdz")
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False, ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]
 Positive = Annotated[float, Field(strict=True, allow_inf_nan=False, gt=0, le=MAX_MAGNITUDE)]
@@ -334,8 +336,18 @@ class ModelBody(Body):
     """A mesh turned into jelly cubes; the origin is that of the model file."""
 
     type: Literal["model"]
-    file: Path = Field(description="mesh file, relative to the scene file")
-    scale: Length = Field(1.0, description="metres per unit of the model file")
+    file: Path = Field(
+        description="OBJ, STL, PLY, OFF, GLB, glTF, USD, 3MF or DAE file, relative to the scene file; what it says of "
+        "its unit and its up axis is applied: metres, and the up axis of the scene"
+    )
+    prim: str | None = Field(
+        None,
+        description="of a USD file, the prim whose meshes are read, like /World/thing; the default prim unless given",
+    )
+    scale: Length | None = Field(
+        None, description="metres per unit of the model file, or a factor where the file says its unit; 1 unless given"
+    )
+    fit: Length | None = Field(None, description="largest extent of the model along its axes, m, instead of scale")
     resolution: int = Field(strict=True, ge=1, le=4096, description="jelly cubes along the longest edge")
     particles_per_edge: int = Field(
         2, strict=True, ge=2, le=256, description="particles along an edge of each jelly cube"
@@ -356,6 +368,14 @@ class ModelBody(Body):
     @classmethod
     def _file_is_relative_to_the_scene(cls, file: Path, info: ValidationInfo) -> Path:
         return _existing(file, info)
+
+    @model_validator(mode="after")
+    def _keys_go_together(self) -> Self:
+        if self.fit is not None and self.scale is not None:
+            refuse("fit", self.fit, "give scale or fit, not both")
+        if self.prim is not None and self.file.suffix.lower() not in USD_EXTENSIONS:
+            refuse("prim", self.prim, f"only USD files have prims: {' '.join(USD_EXTENSIONS)}")
+        return self
 
 
 class Contact(Table):

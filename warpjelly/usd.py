@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -17,7 +16,7 @@ import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
 from .colors import COLOR_MAP, LINEAR_TABLE, color_indices
-from .errors import EnvironmentFailedError, InputError
+from .errors import EnvironmentFailedError, InputError, reason
 from .files import whole_file
 from .scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider, plane_frame
 from .surface import SurfaceFrame, SurfaceMesh
@@ -446,9 +445,3 @@ def _export(layer: Sdf.Layer, path: Path) -> None:
         raise EnvironmentFailedError(f"{path}: cannot write the stage: {reason(error)}") from error
     except OSError as error:
         raise EnvironmentFailedError(f"{path}: cannot write the stage: {error.strerror}") from error
-
-
-def reason(error: Tf.ErrorException) -> str:
-    """Return what an error of USD says first, without the place in USD's source that reports it."""
-    said = re.search(r" : '(.*?)'\s*$", str(error), re.MULTILINE)
-    return said[1] if said else " ".join(str(error).split())

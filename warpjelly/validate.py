@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
 
-from .usd import open_stage, reason
+from .errors import reason
+from .usd import open_stage
 
 # The newest crate version that common viewers open.
 MAX_CRATE_VERSION = (0, 8, 0)
