@@ -425,7 +425,15 @@ def test_voxelize_says_what_a_model_becomes(warpjelly, tmp_path):
     assert "there already" in one_line(err)
     code, out, _ = warpjelly("voxelize", TREE, "-n", 12, "-o", grid, "--force")
     assert code == 0
-    assert f"voxels     {figures['voxels']:>13,} of 8 x 12 x 8" in out
+    assert f"voxels     {figures['voxels']:>13,} of 8 x 12 x 8, 0.08333 m each" in out
+
+
+def test_voxelize_looks_below_a_prim(warpjelly, tmp_path):
+    """Voxelize the body of a stage without the ground it lies on."""
+    assert warpjelly("run", CUBE, "--frames", 1, "-o", tmp_path)[0] == 0
+    code, out, _ = warpjelly("voxelize", tmp_path / "stage.usdc", "-n", 4, "--prim", "/World/bodies/cube", "--json")
+    assert code == 0
+    assert json.loads(out)["voxels"] >= 8
 
 
 @pytest.mark.parametrize(

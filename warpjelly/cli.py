@@ -169,6 +169,9 @@ def voxelize(
         Path | None,
         typer.Option("-o", "--output", help="Grid to write, .npz, for `file` of a body of voxels.", show_default=False),
     ] = None,
+    prim: Annotated[
+        str | None, typer.Option(help="Of a USD file, the prim below which to look.", show_default=False)
+    ] = None,
     method: Annotated[
         Literal["auto", "parity", "winding", "vote"], typer.Option(help="How cells are told to be inside.")
     ] = "auto",
@@ -192,7 +195,9 @@ def voxelize(
     from .plan import survey_model
     from .scenefile import read_scene
 
-    options = {"method": method, "keep_thin_parts": keep_thin_parts, "pieces": pieces}
+    options: dict[str, Any] = {"method": method, "keep_thin_parts": keep_thin_parts, "pieces": pieces}
+    if prim is not None:
+        options["prim"] = prim
     body = {"type": "model", "name": "model", "material": "jelly", "file": str(model.absolute()), **options}
     scene = read_scene({"materials": {"jelly": {}}, "bodies": [{**body, "resolution": resolution}]}, model)
     grid, figures = survey_model(scene)
@@ -206,7 +211,9 @@ def voxelize(
     closed = "watertight" if figures["watertight"] else "not watertight"
     share = f", {figures['volume'] / figures['mesh_volume']:.1%} of the mesh's" if figures["mesh_volume"] else ""
     print(f"{model}: {closed}, method {figures['method']}")
-    print(f"  voxels     {figures['voxels']:>13,} of {' x '.join(map(str, grid.cells.shape))}")
+    print(
+        f"  voxels     {figures['voxels']:>13,} of {' x '.join(map(str, grid.cells.shape))}, {grid.cell_size:.4g} m each"
+    )
     print(f"  pieces     {figures['pieces']:>13,}")
     print(f"  particles  {figures['particles']:>13,}")
     print(f"  springs    {figures['springs']:>13,}")
