@@ -211,9 +211,8 @@ def voxelize(
     closed = "watertight" if figures["watertight"] else "not watertight"
     share = f", {figures['volume'] / figures['mesh_volume']:.1%} of the mesh's" if figures["mesh_volume"] else ""
     print(f"{model}: {closed}, method {figures['method']}")
-    print(
-        f"  voxels     {figures['voxels']:>13,} of {' x '.join(map(str, grid.cells.shape))}, {grid.cell_size:.4g} m each"
-    )
+    cells = f"{' x '.join(map(str, grid.cells.shape))}, {grid.cell_size:.4g} m each"
+    print(f"  voxels     {figures['voxels']:>13,} of {cells}")
     print(f"  pieces     {figures['pieces']:>13,}")
     print(f"  particles  {figures['particles']:>13,}")
     print(f"  springs    {figures['springs']:>13,}")
