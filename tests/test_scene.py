@@ -179,6 +179,13 @@ def test_a_file_that_is_not_toml_is_refused(scene_file, text):
     assert "not valid TOML" in refusal(scene_file(text))
 
 
+def test_a_model_is_not_taken_for_a_scene(tmp_path):
+    """Say what a scene is where a file of another kind is given."""
+    for name, content in (("tree.obj", b"v 0 0 0\n"), ("stage.usdc", b"PXR-USDC\xff\x00")):
+        (tmp_path / name).write_bytes(content)
+        assert "a scene is a .toml or a .w file" in refusal(tmp_path / name)
+
+
 def test_a_file_that_cannot_be_read_is_refused(tmp_path):
     """Name missing files, folders and binary files."""
     assert "No such file" in refusal(tmp_path / "none.toml")

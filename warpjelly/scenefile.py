@@ -62,13 +62,16 @@ def read_scene(data: dict[str, Any], path: Path) -> Scene:
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
+    hint = ""
+    if path.suffix.lower() != ".toml":
+        hint = "; a scene is a .toml or a .w file, which names models and is not one itself"
     try:
         return tomllib.loads(path.read_text(encoding="utf-8-sig"))
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}") from error
+        raise InputError(f"{path}: not a text file: {error.reason} at byte {error.start}{hint}") from error
     # TOML's own errors are among these, and numbers of thousands of digits.
     except ValueError as error:
-        raise InputError(f"{path}: not valid TOML: {error}") from error
+        raise InputError(f"{path}: not valid TOML: {error}{hint}") from error
     except RecursionError as error:
         raise InputError(f"{path}: not valid TOML: lists or tables are nested too deep") from error
     except OSError as error:
