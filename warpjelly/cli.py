@@ -155,7 +155,8 @@ def check(
     print(f"  step       {figures['dt'] * 1e3:>13.4g} ms, {figures['substeps']} a frame, {figures['frames']} frames")
     for name, limit in figures["dt_limit"].items():
         steps = [f"{step * 1e3:.4g} ms" if step else "none" for step in (limit, figures["dt_limit_in_contact"][name])]
-        print(f"  {name:<19} {steps[0]:>10} is its largest stable step; in contact {steps[1]}")
+        used = "; used here" if name == loaded.solver.integrator else ""
+        print(f"  {name:<19} {steps[0]:>10} is its largest stable step; in contact {steps[1]}{used}")
     print(f"  time       {figures['seconds']:>13.3g} s on {figures['device']}, about, stage included")
 
 
