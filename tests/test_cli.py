@@ -1,5 +1,6 @@
 import csv
 import json
+import logging
 import os
 import re
 import shutil
@@ -33,6 +34,9 @@ resolution = 4
 @pytest.fixture
 def warpjelly(monkeypatch, capfd):
     """Return a function that runs a command line and gives exit code, stdout and stderr."""
+
+    # The handler that the command line installs would write to a stream of pytest's that is closed after the test.
+    monkeypatch.setattr(logging.getLogger("warpjelly"), "handlers", [])
 
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["warpjelly", *map(str, arguments)])
