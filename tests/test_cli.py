@@ -35,9 +35,6 @@ resolution = 4
 def warpjelly(monkeypatch, capfd):
     """Return a function that runs a command line and gives exit code, stdout and stderr."""
 
-    # The handler that the command line installs would write to a stream of pytest's that is closed after the test.
-    monkeypatch.setattr(logging.getLogger("warpjelly"), "handlers", [])
-
     def call(*arguments: object) -> tuple[int, str, str]:
         monkeypatch.setattr(sys, "argv", ["warpjelly", *map(str, arguments)])
         capfd.readouterr()
@@ -46,7 +43,9 @@ def warpjelly(monkeypatch, capfd):
         captured = capfd.readouterr()
         return int(exit_code.value.code or 0), captured.out, captured.err
 
-    return call
+    yield call
+    # It would write to a stream that is closed after the test.
+    logging.getLogger("warpjelly").handlers = []
 
 
 def one_line(stderr: str) -> str:
