@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import threading
@@ -123,9 +124,14 @@ class Simulator:
         """Masses, [particle_count], kg; a copy."""
         return self.model.particle_mass.numpy().copy()
 
+    @functools.cached_property
+    def _contact_pairs(self) -> np.ndarray:
+        """What contact adds to the pairs of springs; see ``contact_pairs``."""
+        return contact_pairs(self.model)
+
     @property
     def _duration(self) -> float:
-        """Time from the first to the last frame, s."""
+        """Duration of the scene, s."""
         return self.scene.frame_count / self.scene.fps
 
     def prepare(self) -> None:
@@ -187,7 +193,7 @@ class Simulator:
             if self.substep_count > 0:
                 raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
             pairs = bound_spring_pairs(self.model, self.state.x)
-            self._limits = step_limits(pairs), step_limits(add_contacts(pairs, contact_pairs(self.model)))
+            self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self._contact_pairs))
         return self._limits[contacts]
 
     def broken_limit(self) -> str | None:
@@ -202,7 +208,7 @@ class Simulator:
                     f"the time step of {self.dt:.4g} s is above the largest stable one {where}, {limit:.4g} s: lower "
                     "solver.dt"
                 )
-        bounce = bounce_limits(contact_pairs(self.model))[name]
+        bounce = bounce_limits(self._contact_pairs)[name]
         if bounce is not None and self.dt > bounce:
             return (
                 f"with the time step of {self.dt:.4g} s bounces may gain energy: it is above {BOUNCE_SHARE:g} of what "
@@ -229,7 +235,7 @@ class Simulator:
                 f'solver.dt = "auto": {solver.integrator} has no stable step for this scene, where something is '
                 f"undamped; integrators that have one: {others}"
             )
-        bounce = bounce_limits(contact_pairs(self.model))[solver.integrator]
+        bounce = bounce_limits(self._contact_pairs)[solver.integrator]
         magnetic = magnetic_limits(self.model, self._duration)[solver.integrator]
         step = min(SAFETY[solver.integrator] * limit, math.inf if bounce is None else bounce, magnetic)
         if self.scene.substeps_for(step) > MAX_SUBSTEPS:

@@ -211,11 +211,8 @@ def magnetic_limits(model: Model, duration: float) -> dict[str, float]:
 
 def _touched_together(table: Any) -> list[list[int]]:
     """Return sets of colliders that one particle may be in at once: each such set is part of one of them."""
-    count = len(table.kind)
-    meets = np.zeros((count, count), bool)
-    for i in range(count):
-        for j in range(i):
-            meets[i, j] = meets[j, i] = _may_meet(table, i, j)
+    meets = _may_meet(table)
+    count = len(meets)
     if count > MAX_SORTED_OUT:
         return [[i, *np.flatnonzero(meets[i])] for i in range(count)]
     found: list[list[int]] = []
@@ -236,24 +233,27 @@ def _touched_together(table: Any) -> list[list[int]]:
     return found if count else []
 
 
-def _may_meet(table: Any, i: int, j: int) -> bool:
-    """Say whether a point may be inside two colliders; never wrongly no. Planes count as half-spaces."""
-    kinds, centers = table.kind.numpy(), table.center.numpy().astype(float)
-    radius, normals, sides = (
-        table.size.numpy()[:, 0].astype(float),
-        table.normal.numpy().astype(float),
-        table.side.numpy(),
-    )
-    offset = centers[i] - centers[j]
-    if kinds[i] == kinds[j] == contacts.SPHERE:
-        return bool(np.linalg.norm(offset) <= radius[i] + radius[j])
+def _may_meet(table: Any) -> np.ndarray:
+    """Say whether a point may be inside two colliders, bool [count, count]; never wrongly no, and not of one itself.
+
+    Planes count as half-spaces.
+    """
+    centers, normals = table.center.numpy().astype(float), table.normal.numpy().astype(float)
+    radius, sides = table.size.numpy()[:, 0].astype(float), table.side.numpy().astype(float)
+    sphere = table.kind.numpy() == contacts.SPHERE
+    offset = centers - centers[:, None]
+    # Of the second one's centre above the first one.
+    height = np.einsum("ijk,ik->ij", offset, normals)
+    touching = np.linalg.norm(offset, axis=2) <= radius[:, None] + radius
+    sunk, meeting = np.zeros_like(touching), np.zeros_like(touching)
     # For some body: a half-space keeps each on its own side.
-    if contacts.SPHERE in (kinds[i], kinds[j]):
-        sphere, flat = (i, j) if kinds[i] == contacts.SPHERE else (j, i)
-        height = (centers[sphere] - centers[flat]) @ normals[flat]
-        return bool((sides[flat] * height <= radius[sphere]).any())
-    facing = sides[i] * sides[j] * (normals[i] @ normals[j]) < -1.0 + 1e-6
-    return bool((~facing | (sides[i] * (offset @ normals[i]) >= 0.0)).any())
+    for side in sides.T:
+        sunk |= side[:, None] * height <= radius
+        facing = side[:, None] * side * (normals @ normals.T) < -1.0 + 1e-6
+        meeting |= ~facing | (side[:, None] * height <= 0.0)
+    meets = np.where(sphere[:, None], np.where(sphere, touching, sunk.T), np.where(sphere, sunk, meeting))
+    lower = np.tril(meets, -1)
+    return lower | lower.T
 
 
 def _greatest_together(constant: np.ndarray, table: Any, members: list[int]) -> float:

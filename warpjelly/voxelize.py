@@ -18,12 +18,11 @@ from .files import whole_file
 
 # How cells are told to be inside, by the crossings of a ray from their centres: an odd number; a winding number that is
 # not 0; the majority of odd numbers along three axes.
-DESCRIPTIONS = {
+METHODS = {
     "parity": "what an odd number of surfaces encloses is inside",
     "winding": "what any surface goes round is inside",
     "vote": "inside is where most of three axes say so",
 }
-METHODS = tuple(DESCRIPTIONS)
 # Planes of bits that count crossings.
 PARITY, WINDING = 1, 4
 # The coarse grid on which a closed mesh is looked at before a method is chosen.
@@ -80,7 +79,7 @@ def voxelize_mesh(
     notes = []
     chosen = chosen if method == "auto" else method
     if faults:
-        notes.append(f"the mesh {' and '.join(faults)}; method {chosen}: {DESCRIPTIONS[chosen]}")
+        notes.append(f"the mesh {' and '.join(faults)}; method {chosen}: {METHODS[chosen]}")
     grid = voxelize(triangles, resolution, method=chosen, keep_thin_parts=keep_thin_parts, device=device)
     if grid.thin_triangles and grid.cells.any():
         fate = "kept as the cells that they pass through" if keep_thin_parts else "lost; keep_thin_parts keeps them"
@@ -210,13 +209,10 @@ def keep_largest_piece(grid: VoxelGrid) -> VoxelGrid:
     pieces, sizes = find_pieces(grid.cells)
     if len(sizes) < 2:
         return grid
-    nz = grid.cells.shape[2]
-    low, high, rows = _find_runs(grid.cells)
-    change = np.zeros(grid.cells.size + 1, np.int8)
-    kept = pieces == 0
-    change[rows[kept] * nz + low[kept]] += 1
-    np.subtract.at(change, rows[kept] * nz + high[kept], 1)
-    cells = np.cumsum(change[:-1], dtype=np.int8).astype(bool).reshape(grid.cells.shape)
+    low, high, _ = _find_runs(grid.cells)
+    cells = grid.cells.copy()
+    # In scan order, occupied cells are the runs one after the other.
+    cells[cells] = np.repeat(pieces == 0, high - low)
     return replace(grid, cells=cells)
 
 
