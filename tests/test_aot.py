@@ -46,7 +46,7 @@ def launch_everything() -> None:
         simulator.step()
         simulator.first_lost()
         simulator.diagnostics()
-        simulator.surfaces()
+        simulator.shapes()
         # The kernel of the springs on a GPU.
         model, state = simulator.model, simulator.state
         wp.launch(

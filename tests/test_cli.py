@@ -87,7 +87,7 @@ def test_run_and_the_python_interface_agree(warpjelly, tmp_path):
     for frame in range(3):
         if frame:
             sim.advance_frame()
-        surface = sim.positions[sim.model.surface_particles.numpy()]
+        surface = sim.positions[sim.model.shapes[0].particles[:, 0]]
         np.testing.assert_array_equal(np.asarray(mesh.GetPointsAttr().Get(frame)), surface)
     assert stage.GetEndTimeCode() == 2
 

@@ -11,11 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Usd, UsdGeom
-from stages import cube_surface, make_scene, moved_surface, write_stage
+from stages import cube_surface, make_scene, moved_surface, start_stage, write_stage
 
 from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.preview import render_preview
-from warpjelly.usd import StageWriter
 
 SIZE = (320, 180)
 
@@ -119,9 +118,7 @@ def test_frames_stand_side_by_side(tmp_path: Path) -> None:
 def test_hardest_impact_is_the_default(tmp_path: Path, color: str) -> None:
     """Show the frame with the greatest forces unless told otherwise."""
     mesh = cube_surface()
-    writer = StageWriter(
-        tmp_path / "stage.usdc", scene=make_scene(output={"color": color}), meshes=[mesh], provenance={}
-    )
+    writer = start_stage(tmp_path / "stage.usdc", [mesh], make_scene(output={"color": color}))
     for frame, force in enumerate((1.0, 2.0, 5.0, 2.0, 3.0)):
         forces = np.full(len(mesh.points), force, dtype=np.float32)
         writer.write_frame(frame, [replace(moved_surface(mesh, frame), forces=forces)])

@@ -373,10 +373,10 @@ def test_read_arrays_are_copies(device: str) -> None:
     names = ("positions", "velocities", "forces", "masses")
     before = {name: getattr(simulator, name) for name in names}
     kept = {name: array.copy() for name, array in before.items()}
-    surface = simulator.surfaces()[0]
+    surface = simulator.shapes()[0]
     points = surface.points.copy()
     simulator.step(5)
-    simulator.surfaces()
+    simulator.shapes()
     np.testing.assert_array_equal(surface.points, points)
     for name in names:
         np.testing.assert_array_equal(before[name], kept[name])
@@ -524,22 +524,22 @@ def test_surfaces_show_the_state(precision: str, device: str) -> None:
     simulator = Simulator(make_scene(bodies=bodies, gravity=GRAVITY, solver={"precision": precision}), device=device)
     simulator.step(20)
     x, v, f = simulator.positions, simulator.velocities, simulator.forces
-    particles = simulator.model.surface_particles.numpy()
-    shown = simulator.surfaces()
-    assert [len(surface.points) for surface in shown] == [26, len(World(simulator.scene).keys[1])]
-    for body, surface in zip(simulator.model.bodies, shown, strict=True):
-        here = particles[body.points]
-        np.testing.assert_array_equal(surface.points, x[here].astype(np.float32))
-        np.testing.assert_array_equal(surface.velocities, v[here].astype(np.float32))
-        np.testing.assert_allclose(surface.forces, np.linalg.norm(f[here], axis=1), rtol=4 * EPSILON["float32"])
+    shapes, shown = simulator.model.shapes, simulator.shapes()
+    for body, shape, sample in zip(simulator.model.bodies, shapes, shown, strict=True):
+        here = shape.particles[:, 0] + body.particles.start
+        np.testing.assert_array_equal(sample.points, x[here].astype(np.float32))
+        np.testing.assert_array_equal(sample.velocities, v[here].astype(np.float32))
+        np.testing.assert_allclose(sample.forces, np.linalg.norm(f[here], axis=1), rtol=4 * EPSILON["float32"])
         # Area vectors of the quads, half the cross products of their diagonals, summed at their corners.
-        corners = surface.points[body.quads].astype(float)
+        quads = shape.corners.reshape(-1, 4)
+        corners = sample.points[quads].astype(float)
         area = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
         normals = np.zeros((len(here), 3))
-        np.add.at(normals, body.quads, area[:, None])
+        np.add.at(normals, quads, area[:, None])
         normals /= np.linalg.norm(normals, axis=1)[:, None]
         # Areas of up to 1/4 m^2 from places up to 3 m away, relative to those of at least 1/16 m^2.
-        np.testing.assert_allclose(surface.normals, normals, rtol=0, atol=ROUND_OFF["float32"])
-    # The normals of a cube point away from its centre.
-    outward = x[particles[:26]] - x[:27].mean(axis=0)
+        np.testing.assert_allclose(sample.normals, normals, rtol=0, atol=ROUND_OFF["float32"])
+    # Six faces of 3 x 3 points each, whose normals point away from the centre of the cube.
+    assert len(shown[0].points) == 54
+    outward = shown[0].points - x[:27].mean(axis=0)
     assert ((shown[0].normals * outward).sum(axis=1) > 0).all()

@@ -9,12 +9,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pxr import Gf, Usd, UsdGeom, UsdShade
-from stages import cube_surface, make_scene, moved_surface, write_stage
+from stages import cube_surface, make_scene, moved_surface, start_stage, write_stage
 
 from warpjelly.colors import COLOR_COUNT, LINEAR_TABLE, SRGB_TABLE, color_indices, linear_from_srgb, srgb_from_linear
 from warpjelly.errors import EnvironmentFailedError, InputError
-from warpjelly.surface import SurfaceFrame, SurfaceMesh
-from warpjelly.usd import StageWriter, open_stage
+from warpjelly.shapes import ShapeFrame
+from warpjelly.usd import open_stage
 from warpjelly.validate import stage_problems
 
 FLOORS = {
@@ -28,7 +28,7 @@ def surface_of(stage: Usd.Stage, body: str = "cube") -> UsdGeom.Mesh:
     return UsdGeom.Mesh(stage.GetPrimAtPath(f"/World/bodies/{body}/surface"))
 
 
-def motion(frames: int = 10, center: tuple[float, float, float] = (0.0, 0.5, 0.0)) -> list[SurfaceFrame]:
+def motion(frames: int = 10, center: tuple[float, float, float] = (0.0, 0.5, 0.0)) -> list[ShapeFrame]:
     """Return the frames that ``write_stage`` writes."""
     mesh = cube_surface(center=center)
     return [moved_surface(mesh, frame) for frame in range(frames)]
@@ -87,9 +87,9 @@ def test_rest_pose_is_the_default(tmp_path: Path) -> None:
     stage = open_stage(write_stage(tmp_path / "stage.usdc"))
     mesh = surface_of(stage)
     assert np.array(mesh.GetPointsAttr().Get()).tobytes() == rest.points.tobytes()
-    assert np.array(mesh.GetNormalsAttr().Get()).tobytes() == rest.normals.tobytes()
+    assert np.array(mesh.GetNormalsAttr().Get()).tobytes() == rest.rest.normals.tobytes()
     assert np.array(mesh.GetExtentAttr().Get()).tolist() == [[-0.5, 0.0, -0.5], [0.5, 1.0, 0.5]]
-    assert np.array_equal(mesh.GetFaceVertexIndicesAttr().Get(), rest.quads.ravel())
+    assert np.array_equal(mesh.GetFaceVertexIndicesAttr().Get(), rest.shape.corners)
     color = UsdGeom.Primvar(mesh.GetDisplayColorAttr()).ComputeFlattened()
     np.testing.assert_array_equal(color, np.tile(LINEAR_TABLE[0], (len(rest.points), 1)))
 
@@ -146,11 +146,11 @@ def test_equal_forces_have_one_color(tmp_path: Path, force: float) -> None:
     """Don't stretch colours over rounding when all forces are equal, as in free fall, or zero."""
     rng = np.random.default_rng(0)
     mesh = cube_surface()
-    writer = StageWriter(tmp_path / "stage.usdc", scene=make_scene(), meshes=[mesh], provenance={})
+    writer = start_stage(tmp_path / "stage.usdc", [mesh])
     for t in range(3):
         frame = moved_surface(mesh, t)
         noisy = (force * (1 + 1e-4 * rng.standard_normal(len(mesh.points)))).astype(np.float32)
-        writer.write_frame(t, [SurfaceFrame(frame.points, frame.normals, frame.velocities, noisy)])
+        writer.write_frame(t, [ShapeFrame(frame.points, frame.normals, frame.velocities, noisy)])
     writer.close()
     stage = open_stage(tmp_path / "stage.usdc")
     primvar = UsdGeom.Primvar(surface_of(stage).GetDisplayColorAttr())
@@ -199,7 +199,7 @@ def test_stage_says_what_it_is(tmp_path: Path) -> None:
     """Write units, up axis, kinds, name and provenance, of which USD cannot store all as it is."""
     provenance = {"seed": 7, "deterministic": True, "dt": 1e-3, "scene": {"a": [1, None]}, "steps": np.int64(2**40)}
     mesh = cube_surface()
-    writer = StageWriter(tmp_path / "stage.usdc", scene=make_scene(), meshes=[mesh], provenance=provenance)
+    writer = start_stage(tmp_path / "stage.usdc", [mesh], provenance=provenance)
     writer.close()
     stage = open_stage(tmp_path / "stage.usdc")
     world = stage.GetDefaultPrim()
@@ -265,7 +265,7 @@ def test_several_bodies_keep_apart(tmp_path: Path) -> None:
     assert stage_problems(path) == []
     stage = open_stage(path)
     for mesh in meshes:
-        read = np.array(surface_of(stage, mesh.body).GetPointsAttr().Get(4))
+        read = np.array(surface_of(stage, mesh.shape.body).GetPointsAttr().Get(4))
         assert read.tobytes() == moved_surface(mesh, 4).points.tobytes()
 
 
@@ -281,8 +281,8 @@ def test_stage_is_sound_after_any_number_of_frames(tmp_path: Path, frames: int, 
 def test_buffers_may_be_reused(tmp_path: Path) -> None:
     """Copy what a frame holds, since the simulator writes the next frame into the same arrays."""
     mesh = cube_surface()
-    frame = SurfaceFrame(*(np.zeros_like(mesh.points) for _ in range(3)), np.zeros(len(mesh.points), np.float32))
-    writer = StageWriter(tmp_path / "stage.usdc", scene=make_scene(), meshes=[mesh], provenance={})
+    frame = ShapeFrame(*(np.zeros_like(mesh.points) for _ in range(3)), np.zeros(len(mesh.points), np.float32))
+    writer = start_stage(tmp_path / "stage.usdc", [mesh])
     for t in range(3):
         frame.points[:] = t + mesh.points
         frame.forces[:] = t
@@ -299,13 +299,11 @@ def test_buffers_may_be_reused(tmp_path: Path) -> None:
 def test_frames_out_of_order_are_refused(tmp_path: Path) -> None:
     """Refuse a frame that skips a number and a surface of another size."""
     mesh = cube_surface()
-    writer = StageWriter(tmp_path / "stage.usdc", scene=make_scene(), meshes=[mesh], provenance={})
+    writer = start_stage(tmp_path / "stage.usdc", [mesh])
     with pytest.raises(ValueError, match="frame 1 written where frame 0 is due"):
         writer.write_frame(1, [moved_surface(mesh, 1)])
     with pytest.raises(ValueError, match="cube: points"):
-        writer.write_frame(
-            0, [moved_surface(SurfaceMesh("cube", *(a[:4] for a in (mesh.points, mesh.normals, mesh.quads))), 0)]
-        )
+        writer.write_frame(0, [moved_surface(cube_surface(count=3), 0)])
 
 
 def test_file_appears_only_when_complete(tmp_path: Path) -> None:
@@ -316,7 +314,7 @@ def test_file_appears_only_when_complete(tmp_path: Path) -> None:
         "from pathlib import Path\n"
         "from stages import *\n"
         "mesh = cube_surface()\n"
-        "writer = StageWriter(Path(sys.argv[1]), scene=make_scene(), meshes=[mesh], provenance={})\n"
+        "writer = start_stage(Path(sys.argv[1]), [mesh])\n"
         "writer.write_frame(0, [moved_surface(mesh, 0)])\n"
         "os._exit(9)\n"
     )
@@ -335,7 +333,7 @@ def test_file_appears_only_when_complete(tmp_path: Path) -> None:
 def test_closing_twice_writes_once(tmp_path: Path) -> None:
     """Do nothing on a second close."""
     mesh = cube_surface()
-    writer = StageWriter(tmp_path / "stage.usdc", scene=make_scene(), meshes=[mesh], provenance={})
+    writer = start_stage(tmp_path / "stage.usdc", [mesh])
     writer.close()
     (tmp_path / "stage.usdc").unlink()
     writer.close()

@@ -47,3 +47,9 @@ def color_indices(force: np.ndarray, force_range: tuple[float, float]) -> np.nda
     position = (np.asarray(force, dtype=np.float32) - np.float32(low)) * np.float32((COLOR_COUNT - 1) / (high - low))
     # Unlike clip, fmin and fmax leave no NaN behind, which as an index would be far outside the table.
     return np.rint(np.fmax(np.fmin(position, COLOR_COUNT - 1), 0)).astype(np.int32)
+
+
+# Structural, face shear, body shear and bend springs, told apart by people who see colours differently, too
+# (M. Okabe and K. Ito, Color Universal Design, 2008).
+_KINDS = "0072b2 e69f00 e69f00 009e73"
+KIND_COLORS = linear_from_srgb(np.array([list(bytes.fromhex(color)) for color in _KINDS.split()]) / 255.0)

@@ -83,17 +83,22 @@ class Lattice:
     unit: float
     """Edge of a unit cell, m; without cells, the shortest rest length."""
     surface_particles: np.ndarray
-    """Particle of each point that is shown, int32 [point_count]: those on the surface, ascending; or, where there are
-    no faces, both ends of each spring, one after another."""
+    """Particles on the surface, ascending, int32 [surface_count]; without cells, all."""
     surface_quads: np.ndarray
     """Outward faces, counter-clockwise from outside, indices into surface_particles, int32 [face_count, 4]."""
-    double_sided: bool = False
-    """Whether the faces are seen from both sides."""
+    grid: Grid | None = None
+    """The cells and vertices that it is made of, for what hangs on them."""
+    origin: np.ndarray | None = None
+    """Lowest corner of the grid, float64 [3], m."""
 
     @property
     def spring_count(self) -> int:
         """Number of springs."""
         return int(self.spans[:, 2].sum(dtype=np.int64))
+
+    def grid_coordinates(self, points: np.ndarray) -> np.ndarray:
+        """Return points in the frame of the body, [..., 3], m, in unit cells from the origin of its grid."""
+        return (points - self.origin) / self.unit
 
     def springs(self) -> tuple[np.ndarray, np.ndarray]:
         """Take the spans apart: both ends of each spring, int32 [spring_count, 2], and its class, int32 [spring_count].
@@ -141,6 +146,8 @@ def build_lattice(
         unit=unit,
         surface_particles=surface_particles,
         surface_quads=surface_quads,
+        grid=grid,
+        origin=np.asarray(origin),
     )
 
 

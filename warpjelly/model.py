@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ import warp as wp
 
 from warpjelly.kernels import bounds, contacts, fields, pairs, springs
 from warpjelly.kernels.lattices import BEND, BODY_SHEAR, FACE_SHEAR, STRUCTURAL
+from warpjelly.kernels.shapes import Shapes
 
 from .errors import SceneError
 from .lattice import Lattice
@@ -29,6 +30,7 @@ from .scene import (
     Scene,
     SphereCollider,
 )
+from .shapes import Shape, shapes_of
 
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
@@ -51,12 +53,6 @@ class Body:
 
     name: str
     particles: slice
-    points: slice
-    """Its part of surface_particles."""
-    quads: np.ndarray
-    """Outward faces, indices into the body's points, int32 [face_count, 4]; none where its springs are shown."""
-    double_sided: bool
-    """Whether the faces are seen from both sides."""
     unit: float
     """Edge of a unit cell, m; without cells, the shortest rest length."""
 
@@ -92,10 +88,10 @@ class Model:
     """The table of kernels/contacts.py; a box of the scene is six half-spaces here."""
     fields: Any
     """The table of kernels/fields.py."""
-    surface_particles: wp.array
-    """Particle of each point that is shown, int32 [point_count], body after body."""
-    surface_quads: wp.array
-    """Indices into surface_particles, vec4i [face_count]."""
+    shapes: list[Shape]
+    """What the stage shows, body after body."""
+    shape_table: Any
+    """The table of kernels/shapes.py: the same for all shapes, one after another."""
     skin: Any | None
     """The table of kernels/pairs.py of the particles that collide with others, where any do."""
 
@@ -138,8 +134,9 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     positions, velocities, masses, inverse_masses, charges = ([] for _ in range(5))
     spans, classes, chunks, chunk_bodies = ([] for _ in range(4))
     lattices: list[Lattice] = []
-    surface_particles, surface_quads = [], []
-    particle_count = point_count = spring_count = class_count = 0
+    shapes: list[Shape] = []
+    shape_starts: list[int] = []
+    particle_count = spring_count = class_count = 0
     for number, body_plan in enumerate(plan.bodies):
         body, material = body_plan.body, scene.materials[body_plan.body.material]
         lattice = body_plan.build()
@@ -159,21 +156,16 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         classes.append(spring_classes(material, lattice))
         chunks.append(np.arange(particle_count, particle_count + count, CHUNK_SIZE, dtype=np.int32))
         chunk_bodies.append(np.full(len(chunks[-1]), number, np.int32))
-        surface_particles.append(lattice.surface_particles + np.int32(particle_count))
-        surface_quads.append(lattice.surface_quads + np.int32(point_count))
-        points = len(lattice.surface_particles)
+        shapes += shapes_of(str(body.name), lattice, scene.output, body_plan.drawing)
+        shape_starts += [particle_count] * (len(shapes) - len(shape_starts))
         bodies.append(
             Body(
                 name=str(body.name),
                 particles=slice(particle_count, particle_count + count),
-                points=slice(point_count, point_count + points),
-                quads=lattice.surface_quads,
-                double_sided=lattice.double_sided,
                 unit=lattice.unit,
             )
         )
         particle_count += count
-        point_count += points
         spring_count += lattice.spring_count
         class_count += len(classes[-1])
 
@@ -199,8 +191,8 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         gravity=array(scene.gravity_vector[None], vector),
         colliders=_colliders(scene, [_center_of_mass(x[b.particles], mass[b.particles]) for b in bodies], real, device),
         fields=_fields(scene, real, device),
-        surface_particles=array(np.concatenate(surface_particles), wp.int32),
-        surface_quads=array(np.concatenate(surface_quads), wp.vec4i),
+        shapes=shapes,
+        shape_table=_shape_table(shapes, shape_starts, device),
         skin=_skin(scene, lattices, real, device) if scene.soft_contacts else None,
     )
     slots = int(model.colliders.slot.numpy().max(initial=-1)) + 1
@@ -374,6 +366,37 @@ def _fields(scene: Scene, real: type, device: str) -> Any:
     table.curve_start = array(np.cumsum([len(curve) for curve in curves], dtype=np.int32), wp.int32)
     keyframes = np.concatenate(curves)
     table.curve_time, table.curve_factor = (array(np.ascontiguousarray(column), wp.float64) for column in keyframes.T)
+    return table
+
+
+def _shape_table(shapes: Sequence[Shape], first_particles: Sequence[int], device: str) -> Any:
+    """Return the table of shapes for the kernels, given the first particle of each one's body."""
+
+    def joined(parts: Iterable[np.ndarray], dtype: Any) -> wp.array:
+        return wp.array(np.concatenate([np.zeros(0), *parts]), dtype=dtype, device=device)
+
+    def starts(lengths: Iterable[np.ndarray]) -> wp.array:
+        return wp.array(np.cumsum(np.concatenate([[0], *lengths])), dtype=wp.int32, device=device)
+
+    first_points = np.cumsum([0, *(len(shape.particles) for shape in shapes)])
+    first_normals = np.cumsum([0, *(shape.normal_count for shape in shapes)])
+    table = Shapes()
+    table.point_start = starts(np.full(len(shape.particles), shape.particles.shape[1]) for shape in shapes)
+    table.particles = joined(
+        (shape.particles.ravel() + first for shape, first in zip(shapes, first_particles, strict=True)), wp.int32
+    )
+    table.weights = joined((shape.weights.ravel() for shape in shapes), wp.float32)
+    table.face_start = starts(shape.counts for shape in shapes)
+    table.corners = joined(
+        (shape.corners + first for shape, first in zip(shapes, first_points, strict=False)), wp.int32
+    )
+    table.corner_normals = joined(
+        (
+            (shape.corners if shape.corner_normals is None else shape.corner_normals) + first
+            for shape, first in zip(shapes, first_normals, strict=False)
+        ),
+        wp.int32,
+    )
     return table
 
 

@@ -36,15 +36,13 @@ def build_network(
     else:
         rest = np.array(rest_lengths, float)
     table, rows = np.unique(np.stack([kinds, rest], axis=1), axis=0, return_inverse=True)
-    # A particle without springs is shown as one of no length.
-    lone = np.setdiff1d(np.arange(len(particles)), ends)
     return Lattice(
         particles=particles,
         spans=_join_runs(ends, rows.reshape(-1)),
         classes=SpringClasses(table[:, 0].astype(int), table[:, 1]),
         cell_counts=np.zeros(len(particles), np.uint8),
         unit=float(rest.min()) if len(rest) else 1.0,
-        surface_particles=np.append(ends.ravel(), np.repeat(lone, 2)).astype(np.int32),
+        surface_particles=np.arange(len(particles), dtype=np.int32),
         surface_quads=np.zeros((0, 4), np.int32),
     )
 
@@ -79,7 +77,6 @@ def build_cloth(size: tuple[float, float], particles: tuple[int, int]) -> Lattic
         unit=min(along_x, along_z),
         surface_particles=number.ravel(),
         surface_quads=np.stack([corner.ravel() for corner in corners], axis=1),
-        double_sided=True,
     )
 
 

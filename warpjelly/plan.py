@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .drawing import Drawing
 from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
 from .network import build_cloth, build_network
@@ -56,6 +57,8 @@ class BodyPlan:
     """Number of jelly cubes."""
     grid_size: int = 0
     """Number of cells of its grid, occupied or not."""
+    drawing: Drawing | None = None
+    """The model that it is made from, where it is to be seen."""
 
 
 @dataclass(frozen=True)
@@ -116,12 +119,14 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         particles = body.particles[0] * body.particles[1]
         build = partial(build_cloth, body.size, body.particles)
         return BodyPlan(body, build, particles, 6 * particles, 6 * particles, particles)
+    drawing = None
     if isinstance(body, CubeBody):
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
     elif isinstance(body, ModelBody):
-        grid = voxelize_model(body, up_axis=scene.up_axis).grid
-        cells, origin, cell_size = grid.cells, grid.origin, grid.cell_size
+        model = voxelize_model(body, up_axis=scene.up_axis)
+        cells, origin, cell_size = model.grid.cells, model.grid.origin, model.grid.cell_size
+        drawing = model.drawing if scene.output.surface == "model" else None
     else:
         cells, origin, cell_size = body.grid()
     per_edge = body.particles_per_edge
@@ -134,7 +139,7 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         weighted=scene.materials[body.material].law == "young",
     )
     counts = count_lattice(cells, particles_per_edge=per_edge)
-    return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size)
+    return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size, drawing)
 
 
 @dataclass(frozen=True)
@@ -144,6 +149,8 @@ class VoxelizedModel:
     grid: VoxelGrid
     """In metres."""
     watertight: bool
+    drawing: Drawing
+    """The model in the frame of the body."""
     mesh_volume: float
     """m^3; of a closed mesh that does not intersect itself, the volume inside."""
     warnings: list[str]
@@ -193,7 +200,8 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     in_metres = replace(grid, origin=grid.origin * scale, cell_size=grid.cell_size * scale)
     # By the divergence theorem.
     volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6 * scale**3
-    return VoxelizedModel(in_metres, bool(mesh.is_watertight), volume, notes)
+    drawing = Drawing(mesh.vertices * scale, np.full(len(mesh.faces), 3), mesh.faces.ravel())
+    return VoxelizedModel(in_metres, bool(mesh.is_watertight), drawing, volume, notes)
 
 
 def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:

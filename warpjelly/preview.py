@@ -143,13 +143,13 @@ def _render(pyvista: Any, stage: Usd.Stage, frame: int, size: tuple[int, int]) -
     for curves in _shapes(stage, UsdGeom.BasisCurves):
         points = np.array(curves.GetPointsAttr().Get(frame)).reshape(-1, 3)
         lines = pyvista.line_segments_from_points(points).transform(matrix(curves), inplace=False)
-        if curves.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.vertex:
+        if curves.GetDisplayColorPrimvar().GetInterpolation() != UsdGeom.Tokens.constant:
             lines["color"] = _colors(curves, frame, len(points))
-            tubes = lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True)
-            # Lines of no length, which stand for particles without springs, have no tube.
-            solids += [tubes] if tubes.n_points else []
+            solids.append(lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True))
         else:
             rooms.append(lines)
+    for balls in _shapes(stage, UsdGeom.Points):
+        solids.append(_balls(pyvista, balls, frame).transform(matrix(balls), inplace=False))
     if not solids:
         raise InputError("the stage has nothing to show")
 
@@ -188,19 +188,37 @@ def _surface(pyvista: Any, mesh: UsdGeom.Mesh, frame: int) -> pv.PolyData:
     points = np.array(mesh.GetPointsAttr().Get(frame)).reshape(-1, 3)
     counts = np.array(mesh.GetFaceVertexCountsAttr().Get(frame))
     corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
+    colors, normals = _colors(mesh, frame, len(points)), mesh.GetNormalsAttr().Get(frame)
+    by_corner = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
+    if by_corner and by_corner.GetInterpolation() == UsdGeom.Tokens.faceVarying:
+        # VTK has normals for points alone, so every corner becomes one.
+        points, colors, normals = points[corners], colors[corners], by_corner.ComputeFlattened(frame)
+        corners = np.arange(len(corners))
     # VTK wants each face's number of corners in front of them.
     surface = pyvista.PolyData(points, faces=np.insert(corners, np.cumsum(counts) - counts, counts))
-    normals = mesh.GetNormalsAttr().Get(frame)
     if normals is not None and len(normals) == len(points):
         surface.point_data.active_normals = np.array(normals)
-    surface["color"] = _colors(mesh, frame, len(points))
+    surface["color"] = colors
     return surface
+
+
+def _balls(pyvista: Any, shape: UsdGeom.Points, frame: int) -> pv.PolyData:
+    points = np.array(shape.GetPointsAttr().Get(frame)).reshape(-1, 3)
+    cloud = pyvista.PolyData(points)
+    cloud["color"] = _colors(shape, frame, len(points))
+    ball = pyvista.Icosphere(radius=shape.GetWidthsAttr().Get(frame)[0] / 2, nsub=2)
+    return cloud.glyph(geom=ball, scale=False, orient=False)
 
 
 def _colors(shape: UsdGeom.Gprim, frame: int, count: int) -> np.ndarray:
     """Return the colour of every point, sRGB, uint8 [count, 3]; grey where the stage has none by point."""
     linear = UsdGeom.Primvar(shape.GetDisplayColorAttr()).ComputeFlattened(frame)
-    colors = np.array([[0.4, 0.4, 0.4]] if linear is None or len(linear) not in (1, count) else linear)
+    colors = np.array([[0.4, 0.4, 0.4]] if linear is None or not len(linear) else linear)
+    if shape.GetPrim().IsA(UsdGeom.BasisCurves) and 2 * len(colors) == count:
+        # A colour for each straight line, from one point to the next.
+        colors = np.repeat(colors, 2, axis=0)
+    if len(colors) not in (1, count):
+        colors = np.array([[0.4, 0.4, 0.4]])
     return np.broadcast_to(np.rint(srgb_from_linear(colors) * 255).astype(np.uint8), (count, 3)).copy()
 
 

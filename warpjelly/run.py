@@ -22,10 +22,10 @@ from .expect import Observer, Outcome
 from .files import whole_file
 from .plan import plan_scene
 from .scene import Scene
+from .shapes import SURFACE, ShapeFrame
 from .simulator import Simulator
 from .stability import evaluations
 from .starts import warn_of_deep_starts
-from .surface import SurfaceMesh
 from .usd import STAGE_NAME, StageWriter
 
 log = logging.getLogger("warpjelly")
@@ -112,11 +112,8 @@ def _refuse_to_replace(folder: Path) -> None:
 
 def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callable[[int, int], None]) -> Run:
     scene, total = sim.scene, sim.scene.frame_count
-    meshes = [
-        SurfaceMesh(body.name, surface.points, surface.normals, body.quads, body.double_sided)
-        for body, surface in zip(sim.model.bodies, sim.surfaces(), strict=True)
-    ]
-    writer = StageWriter(folder / STAGE_NAME, scene=scene, meshes=meshes, provenance=provenance(scene, sim))
+    shapes, rest = sim.model.shapes, sim.shapes()
+    writer = StageWriter(folder / STAGE_NAME, scene=scene, shapes=shapes, rest=rest, provenance=provenance(scene, sim))
     observer = Observer(sim)
     sim.prepare()
     stepping, frames = 0.0, 0
@@ -134,7 +131,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
                 metrics.writerow(row)
             metrics.writerow(row.values())
             observer.observe(figures["penetrations"])
-            writer.write_frame(index, sim.surfaces())
+            writer.write_frame(index, sim.shapes())
             frames = index + 1
             progress(frames, total)
     except (DivergedError, KeyboardInterrupt) as error:
@@ -142,7 +139,7 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
     finally:
         # Whatever happens, also what nobody foresaw: the frames that were finished are saved.
         writer.close()
-    _warn_of_inside_out(meshes, sim)
+    _warn_of_inside_out(rest, sim)
     stages = len(STAGES.get(scene.solver.integrator, [None]))
     forces = max(frames - 1, 0) * sim.substeps * stages
     observer.diverged = isinstance(ended, DivergedError)
@@ -193,7 +190,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     if broken := sim.broken_limit():
         log.warning("%s", broken)
     sim.step()
-    sim.surfaces()
+    sim.shapes()
     sim.diagnostics()
     began = time.perf_counter()
     sim.step()
@@ -205,7 +202,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
         sim.step(count)
         substeps += count
     stepped = time.perf_counter()
-    sim.surfaces()
+    sim.shapes()
     sim.diagnostics()
     frame = (stepped - began) / substeps * sim.substeps + time.perf_counter() - stepped
     return {
@@ -256,11 +253,11 @@ def _warn_of_long_steps(sim: Simulator) -> None:
         log.warning("%s", broken)
 
 
-def _warn_of_inside_out(meshes: Sequence[SurfaceMesh], sim: Simulator) -> None:
+def _warn_of_inside_out(rest: Sequence[ShapeFrame], sim: Simulator) -> None:
     names = [
-        mesh.body
-        for mesh, surface in zip(meshes, sim.surfaces(), strict=True)
-        if len(mesh.quads) and not mesh.double_sided and _is_mirrored(mesh.points, surface.points)
+        shape.body
+        for shape, before, now in zip(sim.model.shapes, rest, sim.shapes(), strict=True)
+        if shape.name == SURFACE and not shape.double_sided and _is_mirrored(before.points, now.points)
     ]
     if names:
         log.warning(

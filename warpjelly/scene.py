@@ -667,6 +667,19 @@ class MagneticField(ForceField):
 class Output(Table):
     """What is written."""
 
+    surface: Literal["voxels", "smooth", "model"] = Field(
+        "voxels",
+        description="what the surface of a body of cells is: the faces of its cells, hard where their directions meet; "
+        "the same without steps; or the model that it was made from, deformed",
+    )
+    show: list[Literal["surface", "springs", "particles"]] = Field(
+        ["surface"],
+        min_length=1,
+        description="what is shown of a body; networks, which have no surface, always show springs and particles",
+    )
+    spring_colors: Literal["force", "kind"] = Field(
+        "force", description="what the colours of springs show: forces on their ends, or structural, shear and bend"
+    )
     force_range: tuple[NotNegative, NotNegative] | Literal["auto"] = Field(
         "auto", description="forces at both ends of the colour map, N; auto: 1st to 99th percentile of the run"
     )
@@ -826,6 +839,8 @@ class Scene(Table):
                 refuse(f"expect.{key}.body", None, f"name one of the bodies: {bodies}")
             if expectation.body is not None and expectation.body not in bodies.split(", "):
                 refuse(f"expect.{key}.body", expectation.body, f"no such body; bodies: {bodies}")
+        if self.output.surface == "model" and not any(isinstance(body, ModelBody) for body in self.bodies):
+            refuse("output.surface", "model", "no body is of type model; choose voxels or smooth")
         if self.duration is not None and self.frames is not None:
             refuse("duration", self.duration, "give duration or frames, not both")
         if self.duration is not None and not 1 <= round(self.duration * self.fps) <= MAX_FRAMES:

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, surfaces
+from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, shapes
 
 from .device import choose_device
 from .errors import DivergedError, SceneError
 from .model import Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
+from .shapes import ShapeFrame
 from .softcontact import SoftContact
 from .stability import (
     BOUNCE_SHARE,
@@ -30,7 +31,6 @@ from .stability import (
     magnetic_limits,
     step_limits,
 )
-from .surface import SurfaceFrame
 
 log = logging.getLogger("warpjelly")
 
@@ -68,7 +68,10 @@ class Simulator:
         self.dt = self.scene.dt_for(self.substeps)
         """The time step used, s."""
         chunk_count = len(self.model.chunk_body)
-        point_count = len(self.model.surface_particles)
+        # Where the points and the normals of each shape start.
+        self._point_start = np.cumsum([0, *(len(shape.particles) for shape in self.model.shapes)])
+        self._normal_start = np.cumsum([0, *(shape.normal_count for shape in self.model.shapes)])
+        point_count = int(self._point_start[-1])
         with wp.ScopedDevice(self.device):
             # What only Runge-Kutta schemes need between their stages.
             scratch = self.scene.solver.integrator in integrators.STAGES
@@ -81,7 +84,7 @@ class Simulator:
             self._elastic = wp.zeros(1, dtype=wp.float64)
             self._sums = wp.zeros((chunk_count, diagnostics.COLUMNS), dtype=wp.float64)
             self._points = wp.zeros(point_count, dtype=wp.vec3f)
-            self._normals = wp.zeros(point_count, dtype=wp.vec3f)
+            self._normals = wp.zeros(int(self._normal_start[-1]), dtype=wp.vec3f)
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
         culling = self.scene.solver.culling
@@ -291,32 +294,34 @@ class Simulator:
             "contacts": int(total[diagnostics.CONTACTS]) + pair_contacts,
         }
 
-    def surfaces(self) -> list[SurfaceFrame]:
-        """Return what a frame shows of each body, as copies."""
-        model, state = self.model, self.state
+    def shapes(self) -> list[ShapeFrame]:
+        """Return what a frame shows, a sample of each of ``model.shapes``, as copies."""
+        table, state = self.model.shape_table, self.state
         self._launch(
-            surfaces.gather_surface,
-            len(model.surface_particles),
-            [model.surface_particles, state.x, state.v, state.f],
-            [self._points, self._velocities, self._magnitudes, self._normals],
+            shapes.gather_points,
+            len(self._points),
+            [table, state.x, state.v, state.f],
+            [self._points, self._velocities, self._magnitudes],
         )
-        self._launch(
-            surfaces.add_quad_normals, len(model.surface_quads), [model.surface_quads, self._points], [self._normals]
-        )
-        self._launch(surfaces.normalize, len(self._normals), [], [self._normals])
+        self._normals.zero_()
+        self._launch(shapes.add_face_normals, len(table.face_start) - 1, [table, self._points], [self._normals])
+        self._launch(shapes.normalize, len(self._normals), [], [self._normals])
         points, normals, velocities, magnitudes = (
             array.numpy() for array in (self._points, self._normals, self._velocities, self._magnitudes)
         )
-        # On the CPU numpy() is a live view of the array, which the next frame overwrites.
-        return [
-            SurfaceFrame(
-                points=points[body.points].copy(),
-                normals=normals[body.points].copy(),
-                velocities=velocities[body.points].copy(),
-                forces=magnitudes[body.points].copy(),
+        frames = []
+        for number in range(len(self.model.shapes)):
+            own, own_normals = (slice(*start[number : number + 2]) for start in (self._point_start, self._normal_start))
+            # On the CPU numpy() is a live view of the array, which the next frame overwrites.
+            frames.append(
+                ShapeFrame(
+                    points=points[own].copy(),
+                    normals=normals[own_normals].copy(),
+                    velocities=velocities[own].copy(),
+                    forces=magnitudes[own].copy(),
+                )
             )
-            for body in model.bodies
-        ]
+        return frames
 
     @staticmethod
     def _copy(rows: wp.array) -> np.ndarray:

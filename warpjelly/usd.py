@@ -15,11 +15,11 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
-from .colors import COLOR_MAP, LINEAR_TABLE, color_indices
+from .colors import COLOR_MAP, KIND_COLORS, LINEAR_TABLE, color_indices
 from .errors import EnvironmentFailedError, InputError, reason
 from .files import whole_file
 from .scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider, plane_frame
-from .surface import SurfaceFrame, SurfaceMesh
+from .shapes import SPRINGS, SURFACE, Shape, ShapeFrame
 
 STAGE_NAME = "stage.usdc"
 
@@ -40,8 +40,6 @@ _KEY_DIRECTION = (-0.6, 1.2, 0.5)
 _FILL_DIRECTION = (1.0, 0.4, 0.3)
 # Linear grey of everything that is not jelly.
 _COLLIDER_GREY = 0.4
-# Thickness of a spring that is drawn, in typical lengths of the body's springs.
-_SPRING_WIDTH = 0.06
 # Edge of the square that stands for an infinite wall, in diagonals of the motion.
 _WALL_SIZE = 20.0
 # Forces that vary by less than this share of their value are one force and rounding: no range to stretch colours over.
@@ -52,14 +50,21 @@ class StageWriter:
     """Writes the frames of a run into one stage file."""
 
     def __init__(
-        self, path: Path, *, scene: Scene, meshes: Sequence[SurfaceMesh], provenance: Mapping[str, object]
+        self,
+        path: Path,
+        *,
+        scene: Scene,
+        shapes: Sequence[Shape],
+        rest: Sequence[ShapeFrame],
+        provenance: Mapping[str, object],
     ) -> None:
         """Prepare a stage; no file is made before ``close``.
 
         Args:
             path: the stage file to make, ``.usdc``; its folder is made if missing.
             scene: what was simulated.
-            meshes: one surface for each body.
+            shapes: what is shown.
+            rest: a sample of each, for applications that ask for no time.
             provenance: where the result comes from (versions, device, resolved scene ...), kept as custom data of
                 ``/World``; what USD cannot store as it is becomes JSON.
 
@@ -69,11 +74,11 @@ class StageWriter:
         self._path = path
         _require_writable(path.parent)
         self._scene = scene
-        self._meshes = list(meshes)
+        self._shapes = list(shapes)
         self._layer = Sdf.Layer.CreateAnonymous(".usdc")
         self._frame_count = 0
         self._closed = False
-        self._bounds = np.concatenate([mesh.points for mesh in meshes]).astype(np.float64)
+        self._bounds = np.concatenate([sample.points for sample in rest]).astype(np.float64)
         self._bounds = np.stack([self._bounds.min(axis=0), self._bounds.max(axis=0)])
         self._rest_center = self._bounds.mean(axis=0)
         # With an automatic range, colours have to wait for the last frame.
@@ -83,27 +88,27 @@ class StageWriter:
         _define_world(stage, scene, provenance)
         _define_looks(stage)
         _define_lights(stage, scene)
-        for mesh in meshes:
-            _define_body(stage, mesh, scene)
+        for shape, sample in zip(shapes, rest, strict=True):
+            _define_shape(stage, shape, sample, scene)
 
-    def write_frame(self, index: int, surfaces: Sequence[SurfaceFrame]) -> None:
+    def write_frame(self, index: int, samples: Sequence[ShapeFrame]) -> None:
         """Add one sample.
 
         Args:
             index: number of the frame and its time code; frames arrive in order from 0.
-            surfaces: one for each mesh, in the order of the meshes.
+            samples: one for each shape, in the order of the shapes.
         """
         if index != self._frame_count:
             raise ValueError(f"frame {index} written where frame {self._frame_count} is due")
-        for mesh, surface in zip(self._meshes, surfaces, strict=True):
-            extent = _author_surface(self._layer, index, mesh, surface, self._scene.output.velocities)
+        for shape, sample in zip(self._shapes, samples, strict=True):
+            extent = _author_sample(self._layer, index, shape, sample, self._scene.output.velocities)
             self._bounds[0] = np.minimum(self._bounds[0], extent[0])
             self._bounds[1] = np.maximum(self._bounds[1], extent[1])
         if self._scene.output.force_range == "auto":
-            self._kept_forces.append([np.array(surface.forces, dtype=np.float32) for surface in surfaces])
+            self._kept_forces.append([np.array(sample.forces, dtype=np.float32) for sample in samples])
         else:
-            for mesh, surface in zip(self._meshes, surfaces, strict=True):
-                self._author_colors(index, mesh, surface.forces, self._scene.output.force_range)
+            for shape, sample in zip(self._shapes, samples, strict=True):
+                self._author_colors(index, shape, sample.forces, self._scene.output.force_range)
         self._frame_count += 1
 
     def close(self) -> None:
@@ -118,8 +123,8 @@ class StageWriter:
         if force_range == "auto":
             force_range = _automatic_range(self._kept_forces)
             for index, kept in enumerate(self._kept_forces):
-                for mesh, forces in zip(self._meshes, kept, strict=True):
-                    self._author_colors(index, mesh, forces, force_range)
+                for shape, forces in zip(self._shapes, kept, strict=True):
+                    self._author_colors(index, shape, forces, force_range)
             self._kept_forces.clear()
         stage = Usd.Stage.Open(self._layer)
         stage.SetStartTimeCode(0)
@@ -131,11 +136,11 @@ class StageWriter:
         _export(self._layer, self._path)
         self._closed = True
 
-    def _author_colors(
-        self, index: int, mesh: SurfaceMesh, forces: np.ndarray, force_range: tuple[float, float]
-    ) -> None:
+    def _author_colors(self, index: int, shape: Shape, forces: np.ndarray, force_range: tuple[float, float]) -> None:
+        if shape.kinds is not None:
+            return
         indices = color_indices(forces, force_range)
-        primvar = _surface_path(mesh).AppendProperty("primvars:displayColor")
+        primvar = _shape_path(shape).AppendProperty("primvars:displayColor")
         if self._scene.output.color == "rgb":
             self._layer.SetTimeSample(primvar, index, Vt.Vec3fArray.FromNumpy(LINEAR_TABLE[indices]))
         else:
@@ -166,34 +171,36 @@ def _integers(array: np.ndarray) -> Vt.IntArray:
     return Vt.IntArray.FromNumpy(np.ascontiguousarray(array, dtype=np.int32).ravel())
 
 
-def _surface_path(mesh: SurfaceMesh) -> Sdf.Path:
-    return _BODIES.AppendChild(mesh.body).AppendChild("surface" if len(mesh.quads) else "springs")
+def _shape_path(shape: Shape) -> Sdf.Path:
+    return _BODIES.AppendChild(shape.body).AppendChild(shape.name)
 
 
-def _spring_width(mesh: SurfaceMesh) -> float:
-    """Return how thick springs are drawn, m."""
-    return _SPRING_WIDTH * max(float(np.median(np.linalg.norm(mesh.points[1::2] - mesh.points[::2], axis=1))), 1e-3)
-
-
-def _author_surface(
-    layer: Sdf.Layer, index: int, mesh: SurfaceMesh, surface: SurfaceFrame, with_velocities: bool
-) -> np.ndarray:
-    """Write the shape of a surface at one frame; return its extent [2, 3], m."""
-    if surface.points.shape != mesh.points.shape:
-        raise ValueError(f"{mesh.body}: points {surface.points.shape} for a mesh of {mesh.points.shape}")
-    path = _surface_path(mesh)
-    points = _vectors(surface.points)
-    if len(mesh.quads):
-        extent = UsdGeom.PointBased.ComputeExtent(points)
-        samples = {"points": points, "normals": _vectors(surface.normals), "extent": extent}
-    else:
-        extent = UsdGeom.Curves.ComputeExtent(points, [_spring_width(mesh)])
-        samples = {"points": points, "extent": extent}
+def _author_sample(layer: Sdf.Layer, index: int, shape: Shape, sample: ShapeFrame, with_velocities: bool) -> np.ndarray:
+    """Write a shape at one frame; return its extent [2, 3], m."""
+    if sample.points.shape != (len(shape.particles), 3):
+        raise ValueError(f"{shape.body}: points {sample.points.shape} for a shape of {len(shape.particles)}")
+    points = _vectors(sample.points)
+    samples = {"points": points, "extent": _extent(shape, points)}
+    if shape.name == SURFACE:
+        samples[_normals_name(shape)] = _vectors(sample.normals)
     if with_velocities:
-        samples["velocities"] = _vectors(surface.velocities)
+        samples["velocities"] = _vectors(sample.velocities)
     for name, value in samples.items():
-        layer.SetTimeSample(path.AppendProperty(name), index, value)
-    return np.array(extent)
+        layer.SetTimeSample(_shape_path(shape).AppendProperty(name), index, value)
+    return np.array(samples["extent"])
+
+
+def _extent(shape: Shape, points: Vt.Vec3fArray) -> Vt.Vec3fArray:
+    if shape.name == SURFACE:
+        return UsdGeom.PointBased.ComputeExtent(points)
+    if shape.name == SPRINGS:
+        return UsdGeom.Curves.ComputeExtent(points, [shape.width])
+    return UsdGeom.Points.ComputeExtent(points, Vt.FloatArray(len(points), shape.width))
+
+
+def _normals_name(shape: Shape) -> str:
+    """Return the attribute that holds the normals: those that corners choose from have indices, as a primvar."""
+    return "normals" if shape.corner_normals is None else "primvars:normals"
 
 
 def _define_world(stage: Usd.Stage, scene: Scene, provenance: Mapping[str, object]) -> None:
@@ -257,41 +264,59 @@ def _define_lights(stage: Usd.Stage, scene: Scene) -> None:
         light.MakeMatrixXform().Set(_matrix(_facing(direction, scene), np.zeros(3)))
 
 
-def _define_body(stage: Usd.Stage, mesh: SurfaceMesh, scene: Scene) -> None:
-    path = _surface_path(mesh)
+def _define_shape(stage: Usd.Stage, shape: Shape, rest: ShapeFrame, scene: Scene) -> None:
+    path = _shape_path(shape)
     Usd.ModelAPI(UsdGeom.Xform.Define(stage, path.GetParentPath())).SetKind(Kind.Tokens.component)
-    surface: UsdGeom.PointBased
-    if len(mesh.quads):
-        surface = _define_mesh(stage, path, mesh.points, mesh.normals, mesh.quads, look="jelly")
-        surface.CreateDoubleSidedAttr(mesh.double_sided)
+    prim: UsdGeom.PointBased
+    if shape.name == SURFACE:
+        prim = _define_mesh(stage, path, rest.points, shape.counts, shape.corners)
+        prim.CreateDoubleSidedAttr(shape.double_sided)
+        _define_normals(prim, shape, rest.normals)
+    elif shape.name == SPRINGS:
+        prim = _define_segments(stage, path, rest.points, width=shape.width)
     else:
-        surface = _define_segments(stage, path, mesh.points, width=_spring_width(mesh))
-        _bind(surface, "jelly")
+        prim = _define_balls(stage, path, rest.points, width=shape.width)
+    _bind(prim, "jelly")
     if scene.output.velocities:
-        surface.CreateVelocitiesAttr()
-    color = surface.CreateDisplayColorPrimvar(UsdGeom.Tokens.vertex)
-    at_rest = np.zeros(len(mesh.points), dtype=np.int32)
-    if scene.output.color == "rgb":
-        color.Set(_vectors(LINEAR_TABLE[at_rest]))
+        prim.CreateVelocitiesAttr()
+    if shape.kinds is not None:
+        _set_colors(prim, UsdGeom.Tokens.uniform, KIND_COLORS, shape.kinds, scene)
     else:
-        color.Set(_vectors(LINEAR_TABLE))
-        color.SetIndices(_integers(at_rest))
+        _set_colors(prim, UsdGeom.Tokens.vertex, LINEAR_TABLE, np.zeros(len(rest.points), np.int32), scene)
+
+
+def _set_colors(prim: UsdGeom.Gprim, interpolation: str, table: np.ndarray, indices: np.ndarray, scene: Scene) -> None:
+    color = prim.CreateDisplayColorPrimvar(interpolation)
+    if scene.output.color == "rgb":
+        color.Set(_vectors(table[indices]))
+    else:
+        color.Set(_vectors(table))
+        color.SetIndices(_integers(indices))
+
+
+def _define_normals(mesh: UsdGeom.Mesh, shape: Shape, normals: np.ndarray) -> None:
+    if shape.corner_normals is None:
+        mesh.CreateNormalsAttr(_vectors(normals))
+        mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    else:
+        primvar = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+            "normals", Sdf.ValueTypeNames.Normal3fArray, UsdGeom.Tokens.faceVarying
+        )
+        primvar.Set(_vectors(normals))
+        primvar.SetIndices(_integers(shape.corner_normals))
 
 
 def _define_mesh(
-    stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, normals: np.ndarray, quads: np.ndarray, *, look: str
+    stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, counts: np.ndarray, corners: np.ndarray
 ) -> UsdGeom.Mesh:
     mesh = UsdGeom.Mesh.Define(stage, path)
     mesh.CreateSubdivisionSchemeAttr(UsdGeom.Tokens.none)
     mesh.CreateOrientationAttr(UsdGeom.Tokens.rightHanded)
     mesh.CreateDoubleSidedAttr(False)
-    mesh.CreateFaceVertexCountsAttr(_integers(np.full(len(quads), 4)))
-    mesh.CreateFaceVertexIndicesAttr(_integers(quads))
+    mesh.CreateFaceVertexCountsAttr(_integers(counts))
+    mesh.CreateFaceVertexIndicesAttr(_integers(corners))
     mesh.CreatePointsAttr(_vectors(points))
-    mesh.CreateNormalsAttr(_vectors(normals))
-    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
     mesh.CreateExtentAttr(UsdGeom.PointBased.ComputeExtent(mesh.GetPointsAttr().Get()))
-    _bind(mesh, look)
     return mesh
 
 
@@ -339,8 +364,10 @@ def _define_rectangle(
     tangent, bitangent, normal = frame
     corners = np.array([[-0.5, -0.5], [0.5, -0.5], [0.5, 0.5], [-0.5, 0.5]]) * size
     points = center + corners @ np.stack([tangent, bitangent])
-    quad = np.array([[0, 1, 2, 3]])
-    return _define_mesh(stage, path, points, np.tile(normal, (4, 1)), quad, look="collider")
+    mesh = _define_mesh(stage, path, points, np.array([4]), np.arange(4))
+    mesh.CreateNormalsAttr(_vectors(np.tile(normal, (4, 1))))
+    mesh.SetNormalsInterpolation(UsdGeom.Tokens.vertex)
+    return mesh
 
 
 def _define_edges(stage: Usd.Stage, path: Sdf.Path, box: BoxCollider, *, width: float) -> UsdGeom.BasisCurves:
@@ -362,6 +389,16 @@ def _define_segments(stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, *, wi
     curves.SetWidthsInterpolation(UsdGeom.Tokens.constant)
     curves.CreateExtentAttr(UsdGeom.Curves.ComputeExtent(curves.GetPointsAttr().Get(), [width]))
     return curves
+
+
+def _define_balls(stage: Usd.Stage, path: Sdf.Path, points: np.ndarray, *, width: float) -> UsdGeom.Points:
+    balls = UsdGeom.Points.Define(stage, path)
+    balls.CreatePointsAttr(_vectors(points))
+    # One for all would do, but then USD cannot compute extents.
+    balls.CreateWidthsAttr(Vt.FloatArray(len(points), width))
+    balls.SetWidthsInterpolation(UsdGeom.Tokens.vertex)
+    balls.CreateExtentAttr(UsdGeom.Points.ComputeExtent(balls.GetPointsAttr().Get(), balls.GetWidthsAttr().Get()))
+    return balls
 
 
 def _define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:

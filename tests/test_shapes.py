@@ -1,0 +1,293 @@
+"""What is shown of a body: points that hang on its particles, in place at rest and true to any motion."""
+
+from __future__ import annotations
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from pxr import Usd, UsdGeom
+from worlds import make_scene
+
+from warpjelly.colors import KIND_COLORS
+from warpjelly.drawing import Drawing
+from warpjelly.embedding import containing_cells, embed, face_cells
+from warpjelly.lattice import Lattice, build_lattice
+from warpjelly.run import simulate
+from warpjelly.scene import Output
+from warpjelly.shapes import Shape, shapes_of
+from warpjelly.simulator import Simulator
+from warpjelly.usd import open_stage
+from warpjelly.validate import stage_problems
+
+ORIGIN, CELL = np.array([-1.0, 0.5, 2.0]), 0.25
+
+
+def random_lattice(seed: int, particles_per_edge: int = 2) -> tuple[np.ndarray, Lattice]:
+    """Return occupied unit cells and the lattice of them."""
+    cells = np.random.default_rng(seed).random((4, 5, 3)) < 0.4
+    lattice = build_lattice(cells, origin=ORIGIN, cell_size=CELL, particles_per_edge=particles_per_edge)
+    for axis in range(3):
+        cells = np.repeat(cells, particles_per_edge - 1, axis=axis)
+    return cells, lattice
+
+
+def hung(particles: np.ndarray, weights: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the means of the values of particles, in float64."""
+    return np.einsum("pk,pkc->pc", weights.astype(float), values[particles])
+
+
+def only(shapes: list[Shape], name: str) -> Shape:
+    """Return the shape of that name."""
+    (shape,) = [shape for shape in shapes if shape.name == name]
+    return shape
+
+
+@pytest.mark.parametrize("particles_per_edge", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_points_hang_on_the_cell_that_holds_them_or_the_nearest(seed: int, particles_per_edge: int) -> None:
+    """Compare cells with a search through all of them, for points in, around and far away from a body."""
+    cells, lattice = random_lattice(seed, particles_per_edge)
+    rng = np.random.default_rng(seed)
+    local = rng.uniform(-2.0, 2.0 + max(cells.shape), (400, 3))
+    local[:50] = rng.uniform(-100.0, 100.0, (50, 3))
+    points = ORIGIN + local * lattice.unit
+    found = containing_cells(lattice, points)
+    assert cells[tuple(found.T)].all()
+    occupied = np.argwhere(cells)
+    away = np.linalg.norm(local[:, None] - np.clip(local[:, None], occupied, occupied + 1), axis=2)
+    own = np.linalg.norm(local - np.clip(local, found, found + 1), axis=1)
+    # The surface is searched in float32, up to 100 cells away.
+    np.testing.assert_allclose(own, away.min(axis=1), rtol=1e-6, atol=1e-5)
+    assert (away.min(axis=1) == 0).any() and (away.min(axis=1) > 1).any()
+
+
+@pytest.mark.parametrize("particles_per_edge", [2, 3])
+@pytest.mark.parametrize("seed", range(3))
+def test_embedded_points_follow_every_affine_motion(seed: int, particles_per_edge: int) -> None:
+    """Find each point where an affine map takes it, inside of its cell and outside; trilinear inside."""
+    _, lattice = random_lattice(seed, particles_per_edge)
+    rng = np.random.default_rng(seed)
+    points = ORIGIN + rng.uniform(-1.0, 6.0, (300, 3)) * lattice.unit
+    cells = containing_cells(lattice, points)
+    particles, weights = embed(lattice, points, cells)
+    # Each weight is rounded once, and none is larger than the distance from the cell, here below 30 cells.
+    np.testing.assert_allclose(weights.sum(axis=1, dtype=float), 1.0, rtol=0, atol=8 * 30 * 2**-24)
+    matrix, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
+    moved = hung(particles, weights, lattice.particles @ matrix.T + shift)
+    np.testing.assert_allclose(moved, points @ matrix.T + shift, rtol=0, atol=1e-4)
+    # A function of the corner that is linear along each axis alone has its own value inside.
+    local = lattice.grid_coordinates(points)
+    inside = ((local >= cells) & (local <= cells + 1)).all(axis=1)
+    assert inside.any()
+    product = lattice.grid_coordinates(lattice.particles).prod(axis=1)[:, None]
+    np.testing.assert_allclose(
+        hung(particles, weights, product)[inside, 0], local[inside].prod(axis=1), rtol=0, atol=8 * 2000 * 2**-24
+    )
+
+
+def test_far_points_are_carried_on_straight() -> None:
+    """Continue the motion of the nearest point of the cell linearly, not with the products of trilinear weights."""
+    lattice = build_lattice(np.ones((1, 1, 1), bool), origin=np.zeros(3), cell_size=1.0)
+    point = np.array([[11.0, 11.0, 11.0]])
+    particles, weights = embed(lattice, point, np.zeros((1, 3), np.int32))
+    # One corner lifted by d lifts the nearest point by d, and each axis adds its slope d times the 10 cells.
+    lifted = np.zeros((8, 1))
+    lifted[7] = 1.0
+    assert hung(particles, weights, lifted)[0, 0] == pytest.approx(31.0, rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_blocky_surfaces_split_where_directions_meet(seed: int) -> None:
+    """Share points within a direction, between cells that share particles, and nowhere else."""
+    _, lattice = random_lattice(seed)
+    shape = only(shapes_of("body", lattice, Output()), "surface")
+    quads = shape.corners.reshape(-1, 4)
+    particles = shape.particles[:, 0][quads]
+    np.testing.assert_array_equal(particles, lattice.surface_particles[lattice.surface_quads])
+    at = lattice.particles[particles]
+    outward = np.cross(at[:, 2] - at[:, 0], at[:, 3] - at[:, 1])
+    direction = np.rint(outward / np.linalg.norm(outward, axis=1)[:, None]).astype(int)
+    keys = {}
+    for corner, particle, normal in zip(quads.ravel(), particles.ravel(), np.repeat(direction, 4, axis=0), strict=True):
+        keys.setdefault(int(corner), set()).add((int(particle), *normal.tolist()))
+    assert all(len(key) == 1 for key in keys.values())
+    assert len(keys) == len({key.pop() for key in keys.values()}) == len(shape.particles)
+
+
+def test_a_blocky_cube_has_flat_faces_and_hard_edges() -> None:
+    """Give the points of a cube at rest the normals of its six faces."""
+    scene = make_scene(bodies=[{"type": "cube", "name": "cube", "material": "jelly", "particles_per_edge": 4}])
+    (sample,) = Simulator(scene, device="cpu").shapes()
+    assert Counter(map(tuple, (sample.normals + 0.0).tolist())) == Counter(
+        {tuple(sign * float(axis == k) + 0.0 for k in range(3)): 16 for axis in range(3) for sign in (-1.0, 1.0)}
+    )
+
+
+def sphere_cells(radius: int) -> np.ndarray:
+    """Return the cells of a ball, bool [2 radius, ...]."""
+    centers = np.arange(2 * radius) + 0.5 - radius
+    x, y, z = np.meshgrid(centers, centers, centers, indexing="ij")
+    return x**2 + y**2 + z**2 < radius**2
+
+
+def test_smooth_surfaces_lose_the_steps_but_not_the_volume() -> None:
+    """Compare the surface of a ball of cells with the ball: normals, volume, and how far it is from round."""
+    radius = 8
+    lattice = build_lattice(sphere_cells(radius), origin=np.full(3, -8.0), cell_size=1.0)
+    meshes = {}
+    for surface in ("voxels", "smooth"):
+        shape = only(shapes_of("ball", lattice, Output(surface=surface)), "surface")
+        points = hung(shape.particles, shape.weights, lattice.particles)
+        quads = shape.corners.reshape(-1, 4)
+        meshes[surface] = trimesh.Trimesh(points, quads[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3), process=False)
+    smooth, blocky = meshes["smooth"], meshes["voxels"]
+    assert smooth.is_watertight and smooth.is_winding_consistent
+    # The filter keeps what is long against a cell to some percent.
+    assert smooth.volume == pytest.approx(blocky.volume, rel=0.05)
+    spread = {name: np.linalg.norm(mesh.vertices, axis=1).std() for name, mesh in meshes.items()}
+    assert spread["smooth"] < spread["voxels"] / 2
+    angles = {}
+    for name, mesh in meshes.items():
+        middles = mesh.triangles_center / np.linalg.norm(mesh.triangles_center, axis=1)[:, None]
+        angles[name] = np.degrees(np.arccos(np.clip((mesh.face_normals * middles).sum(axis=1), -1, 1))).mean()
+    assert angles["smooth"] < angles["voxels"] / 3
+
+
+def test_smooth_surfaces_of_cells_that_only_touch_stay_apart() -> None:
+    """Hang each point on particles of its own cells, be the other cell ever so near."""
+    cells = np.zeros((2, 2, 1), bool)
+    cells[0, 0] = cells[1, 1] = True
+    lattice = build_lattice(cells, origin=np.zeros(3), cell_size=1.0)
+    shape = only(shapes_of("two", lattice, Output(surface="smooth")), "surface")
+    for point, particle in enumerate(lattice.surface_particles):
+        assert particle in shape.particles[point]
+    ours = lattice.particles[:, 0] < 1.0
+    for quad in shape.corners.reshape(-1, 4):
+        sides = {bool(np.mean(lattice.particles[shape.particles[point]], axis=0)[0] < 1.0) for point in quad}
+        assert len(sides) == 1
+    assert ours.any()
+
+
+def test_faces_know_their_cells() -> None:
+    """Find the occupied cell behind every face."""
+    cells, lattice = random_lattice(5)
+    assert cells[tuple(face_cells(lattice).T)].all()
+
+
+def write_ball(path: Path) -> trimesh.Trimesh:
+    """Write a model that is curved and far from its own origin."""
+    mesh = trimesh.creation.icosphere(subdivisions=3, radius=0.5)
+    mesh.apply_translation([3.0, 1.0, -2.0])
+    mesh.export(path)
+    return mesh
+
+
+def model_scene(path: Path, **output: Any) -> Any:
+    """Return a scene of one model."""
+    body = {"type": "model", "name": "ball", "material": "jelly", "file": str(path), "resolution": 5}
+    return make_scene(
+        bodies=[body], output={"surface": "model", **output}, frames=3, gravity=[0.0, -9.81, 0.0], solver={"dt": 5e-4}
+    )
+
+
+def test_an_embedded_model_at_rest_is_the_original(tmp_path: Path, precision: str) -> None:
+    """Compare the rest pose with the file: the same polygons, every vertex within 1e-6 of the size."""
+    mesh = write_ball(tmp_path / "ball.ply")
+    scene = model_scene(tmp_path / "ball.ply").model_copy(
+        update={"solver": make_scene(solver={"precision": precision}).solver}
+    )
+    simulator = Simulator(scene, device="cpu")
+    (shape,), (sample,) = simulator.model.shapes, simulator.shapes()
+    assert shape.name == "surface"
+    triangles = sample.points[shape.corners.reshape(-1, 3)]
+    assert len(triangles) == len(mesh.faces)
+    found = triangles[np.lexsort(triangles.mean(axis=1).T.round(4))]
+    expected = mesh.triangles[np.lexsort(mesh.triangles.mean(axis=1).T.round(4))]
+    np.testing.assert_allclose(found.mean(axis=1), expected.mean(axis=1), rtol=0, atol=1e-6)
+
+
+def test_an_embedded_model_goes_where_its_lattice_goes(tmp_path: Path) -> None:
+    """Let a model fall freely: every vertex falls by the same distance."""
+    write_ball(tmp_path / "ball.ply")
+    simulator = Simulator(model_scene(tmp_path / "ball.ply"), device="cpu")
+    before = simulator.shapes()[0]
+    simulator.advance_frame()
+    after = simulator.shapes()[0]
+    steps, dt = simulator.substeps, simulator.dt
+    drop = -9.81 * dt**2 * steps * (steps + 1) / 2
+    # Float32 coordinates of up to 4 m, rounded in each substep.
+    np.testing.assert_allclose(after.points - before.points, np.tile([0, drop, 0], (len(before.points), 1)), atol=1e-5)
+    np.testing.assert_allclose(after.velocities[:, 1], -9.81 * dt * steps, rtol=1e-5)
+    np.testing.assert_allclose(after.normals, before.normals, rtol=0, atol=1e-3)
+
+
+def test_the_stage_of_an_embedded_model_is_sound(tmp_path: Path) -> None:
+    """Write its own polygons, and normals that corners share, at rest and at every frame."""
+    write_ball(tmp_path / "ball.obj")
+    simulate(model_scene(tmp_path / "ball.obj", velocities=True), output=tmp_path / "run", device="cpu")
+    assert stage_problems(tmp_path / "run") == []
+    stage = open_stage(tmp_path / "run")
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/bodies/ball/surface"))
+    assert set(mesh.GetFaceVertexCountsAttr().Get()) == {3}
+    normals = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
+    for time in (Usd.TimeCode.Default(), 0, 2):
+        at = np.array(mesh.GetPointsAttr().Get(time))[list(mesh.GetFaceVertexIndicesAttr().Get())]
+        shown = np.array(normals.ComputeFlattened(time))
+        outward = at - np.array(mesh.GetPointsAttr().Get(time)).mean(axis=0)
+        cosines = (shown * outward).sum(axis=1) / np.linalg.norm(outward, axis=1)
+        assert cosines.min() > 0.99
+
+
+def test_springs_and_particles_are_shown_where_asked(tmp_path: Path) -> None:
+    """Write springs in the colours of their kinds and particles in those of forces, beside the surface."""
+    output = {"show": ["surface", "springs", "particles"], "spring_colors": "kind"}
+    body = {"type": "cube", "name": "cube", "material": "jelly", "particles_per_edge": 3}
+    scene = make_scene(bodies=[body], output=output, frames=2)
+    simulate(scene, output=tmp_path, device="cpu")
+    assert stage_problems(tmp_path) == []
+    stage = open_stage(tmp_path)
+    children = stage.GetPrimAtPath("/World/bodies/cube").GetChildren()
+    assert [str(prim.GetName()) for prim in children] == ["surface", "springs", "particles"]
+    curves, balls = UsdGeom.BasisCurves(children[1]), UsdGeom.Points(children[2])
+    simulator = Simulator(scene, device="cpu")
+    for frame in range(2):
+        np.testing.assert_array_equal(balls.GetPointsAttr().Get(frame), simulator.positions.astype(np.float32))
+        simulator.advance_frame()
+    colors = np.array(curves.GetDisplayColorPrimvar().ComputeFlattened(1))
+    ends = np.array(curves.GetPointsAttr().Get()).reshape(-1, 2, 3)
+    lengths = np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1) / 0.5
+    # Structural springs are one unit cell long, bend springs two; shear springs are diagonals.
+    kind = np.select([np.isclose(lengths, 1.0), np.isclose(lengths, 2.0)], [0, 3], 1)
+    np.testing.assert_allclose(colors, KIND_COLORS[kind], rtol=1e-6)
+    assert Counter(kind.tolist()) == {0: 54, 1: 72 + 32, 3: 27}
+
+
+def box_drawing(**changes: Any) -> Drawing:
+    """Return a cube of six quads."""
+    vertices = np.array(list(np.ndindex(2, 2, 2)), float)
+    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+    return Drawing(**{"vertices": vertices, "counts": np.full(6, 4), "corners": np.ravel(quads), **changes})
+
+
+def test_creases_stay_hard_and_the_rest_smooth() -> None:
+    """Share normals across shallow edges and across repeated vertices, not across steep ones."""
+    assert len(np.unique(box_drawing().shading())) == 24
+    ball = trimesh.creation.icosphere(subdivisions=3)
+    smooth = Drawing(ball.vertices, np.full(len(ball.faces), 3), ball.faces.ravel())
+    assert len(np.unique(smooth.shading())) == len(ball.vertices)
+    # As formats write it that repeat vertices.
+    loose = Drawing(ball.vertices[ball.faces.ravel()], np.full(len(ball.faces), 3), np.arange(ball.faces.size))
+    np.testing.assert_array_equal(loose.shading(), smooth.shading())
+
+
+def test_a_models_own_normals_say_what_is_smooth() -> None:
+    """Share a normal where the file has the same one for a vertex."""
+    drawing = box_drawing()
+    outward = (drawing.vertices[drawing.corners] - 0.5) / np.sqrt(0.75)
+    assert len(np.unique(box_drawing(normals=outward).shading())) == 8
+    flat = np.repeat(np.eye(3), 8, axis=0)
+    assert len(np.unique(box_drawing(normals=flat).shading())) == 24
