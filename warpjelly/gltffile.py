@@ -9,6 +9,7 @@ from __future__ import annotations
 import base64
 import json
 import logging
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -18,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
-from .looks import Look, Texture, Value, image_file
+from .looks import Look, Placing, Texture, Value, image_file
 from .polygons import Model, Part, from_polygons, placed
 
 log = logging.getLogger("warpjelly")
@@ -245,11 +246,21 @@ def _texture(file: _File, material: str, kind: str, use: dict[str, Any], uv_set:
     if found is None:
         log.warning("%s: material %s has no %s", file.path, material, kind)
         return None
-    if "KHR_texture_transform" in use.get("extensions", {}):
-        log.warning("%s: material %s: its %s is not moved, turned or scaled", file.path, material, kind)
     sampler = file.all("samplers")[texture["sampler"]] if "sampler" in texture else {}
-    wrap = tuple(_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT"))
-    return Texture(*found, srgb=kind in _SRGB, wrap=(wrap[0], wrap[1]))
+    along_u, along_v = (_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT"))
+    placing = _placing(use.get("extensions", {}).get("KHR_texture_transform", {}))
+    return Texture(*found, srgb=kind in _SRGB, wrap=(along_u, along_v), placing=placing)
+
+
+def _placing(transform: dict[str, Any]) -> Placing:
+    """Return the transform of a texture for a v that points up instead of down."""
+    turn, (x, y) = transform.get("rotation", 0.0), transform.get("offset", (0.0, 0.0))
+    along_u, along_v = transform.get("scale", (1.0, 1.0))
+    return Placing(
+        -math.degrees(turn),
+        (along_u, along_v),
+        (x - math.sin(turn) * along_v, 1.0 - y - math.cos(turn) * along_v),
+    )
 
 
 def _image(file: _File, image: dict[str, Any], number: int) -> tuple[str, bytes] | None:

@@ -12,6 +12,16 @@ log = logging.getLogger("warpjelly")
 
 
 @dataclass(frozen=True)
+class Placing:
+    """Where in an image a UV is: it is scaled, turned, and then moved, as by a UsdTransform2d."""
+
+    rotation: float = 0.0
+    """Counterclockwise [deg]."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    translation: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
 class Texture:
     """An image that gives an input its values, at the UVs of the corners; v points up in it."""
 
@@ -29,6 +39,7 @@ class Texture:
     """Factors of red, green, blue and alpha."""
     bias: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
     """What is added to them thereafter."""
+    placing: Placing = Placing()
 
     def of(self, channel: str) -> Self:
         """Return another channel of the same texture."""

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from .looks import NORMAL_BIAS, NORMAL_SCALE, Look, Texture, Value, image_file, shininess_roughness
+from .looks import NORMAL_BIAS, NORMAL_SCALE, Look, Placing, Texture, Value, image_file, shininess_roughness
 
 log = logging.getLogger("warpjelly")
 
@@ -43,6 +43,7 @@ _MAPS = {
     "norm": ("normal", Texture("", b"", scale=NORMAL_SCALE, bias=NORMAL_BIAS)),
 }
 # Numbers that may stand behind an option of a map, at most; other options have one word.
+_NUMBER = re.compile(r"[-+]?[\d.]+")
 _OPTION_NUMBERS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 
 
@@ -83,10 +84,14 @@ def _inputs(file: Path, name: str, statements: dict[str, list[str]]) -> dict[str
     for kind, (target, texture) in _MAPS.items():
         if kind not in statements:
             continue
-        words, clamped = _without_options(statements[kind])
-        if image := image_file(file, " ".join(words)):
-            wrap = ("clamp", "clamp") if clamped else texture.wrap
-            inputs[target] = replace(texture, name=image[0], data=image[1], wrap=wrap)
+        try:
+            options, name = _options(statements[kind])
+            placing = Placing(0.0, _pair(options.get("-s", []), 1.0), _pair(options.get("-o", []), 0.0))
+        except ValueError:
+            continue
+        if image := image_file(file, name):
+            wrap = ("clamp", "clamp") if options.get("-clamp") == ["on"] else texture.wrap
+            inputs[target] = replace(texture, name=image[0], data=image[1], wrap=wrap, placing=placing)
     color, cutout = inputs.get("diffuseColor"), inputs.get("opacity")
     if isinstance(color, Texture) and isinstance(cutout, Texture) and color.data == cutout.data:
         # A map of colours with transparency has it in its alpha.
@@ -94,13 +99,19 @@ def _inputs(file: Path, name: str, statements: dict[str, list[str]]) -> dict[str
     return inputs
 
 
-def _without_options(words: list[str]) -> tuple[list[str], bool]:
-    """Return the name of the file that a map is in, as words, and whether it is clamped."""
-    clamped = False
+def _options(words: list[str]) -> tuple[dict[str, list[str]], str]:
+    """Return the options of a map, each with its words, and the name of its file."""
+    options = {}
     while len(words) > 2 and words[0].startswith("-"):
-        clamped |= words[:2] == ["-clamp", "on"]
         end = 2
-        while end < len(words) and end <= _OPTION_NUMBERS.get(words[0], 1) and re.fullmatch(r"[-+.\deE]+", words[end]):
+        while end < len(words) and end <= _OPTION_NUMBERS.get(words[0], 1) and _NUMBER.fullmatch(words[end]):
             end += 1
+        options[words[0]] = words[1:end]
         words = words[end:]
-    return words, clamped
+    return options, " ".join(words)
+
+
+def _pair(words: list[str], default: float) -> tuple[float, float]:
+    """Return the first two of the numbers of an option, or what they are where they are not given."""
+    along_u, along_v, *_ = [*map(float, words), default, default]
+    return along_u, along_v

@@ -9,7 +9,7 @@ from typing import Any
 
 from pxr import Ar, Gf, Sdf, Usd, UsdShade
 
-from .looks import Look, Texture, Value
+from .looks import Look, Placing, Texture, Value
 
 log = logging.getLogger("warpjelly")
 
@@ -73,6 +73,19 @@ def _texture(file: Path, output: Usd.Attribute, name: str) -> Texture | None:
         (along_u, along_v),
         tuple(_input(shader, "scale", (1.0, 1.0, 1.0, 1.0))),
         tuple(_input(shader, "bias", (0.0, 0.0, 0.0, 0.0))),
+        _placing(shader),
+    )
+
+
+def _placing(texture: UsdShade.Shader) -> Placing:
+    """Return what is done to the UVs of a texture."""
+    source = _source(texture, "st")
+    shader = UsdShade.Shader(source.GetPrim()) if source else None
+    if not shader or shader.GetShaderId() != "UsdTransform2d":
+        return Placing()
+    along_u, along_v = _input(shader, "scale", (1.0, 1.0))
+    return Placing(
+        _input(shader, "rotation", 0.0), (along_u, along_v), tuple(_input(shader, "translation", (0.0, 0.0)))
     )
 
 
@@ -131,9 +144,18 @@ def _define_texture(material: UsdShade.Material, name: str, texture: Texture, fi
     reader = UsdShade.Shader.Define(stage, path.AppendChild("st"))
     reader.CreateIdAttr("UsdPrimvarReader_float2")
     reader.CreateInput("varname", types.String).Set("st")
+    uvs = reader.CreateOutput("result", types.Float2)
+    if texture.placing != Placing():
+        transform = UsdShade.Shader.Define(stage, path.AppendChild(f"{name}_placing"))
+        transform.CreateIdAttr("UsdTransform2d")
+        transform.CreateInput("in", types.Float2).ConnectToSource(uvs)
+        transform.CreateInput("rotation", types.Float).Set(texture.placing.rotation)
+        transform.CreateInput("scale", types.Float2).Set(Gf.Vec2f(*texture.placing.scale))
+        transform.CreateInput("translation", types.Float2).Set(Gf.Vec2f(*texture.placing.translation))
+        uvs = transform.CreateOutput("result", types.Float2)
     shader = UsdShade.Shader.Define(stage, path.AppendChild(name))
     shader.CreateIdAttr("UsdUVTexture")
-    shader.CreateInput("st", types.Float2).ConnectToSource(reader.CreateOutput("result", types.Float2))
+    shader.CreateInput("st", types.Float2).ConnectToSource(uvs)
     shader.CreateInput("file", types.Asset).Set(file)
     shader.CreateInput("sourceColorSpace", types.Token).Set("sRGB" if texture.srgb else "raw")
     for key, wrap in zip(("wrapS", "wrapT"), texture.wrap, strict=True):

@@ -246,24 +246,32 @@ def _at_corners(
 def _grouped(mesh: UsdGeom.Mesh, part: Part, looks: _Looks) -> Part:
     """Return a part with what its polygons belong to: prims, subsets and materials."""
     prims = _ancestors(mesh.GetPrim())[::-1]
-    names = tuple(name for prim in prims for name in (str(prim.GetPath()), prim.GetName()))
-    whole, material_names = looks.number(mesh.GetPrim())
-    chosen = np.full(len(part.counts), whole)
-    groups, found = np.zeros(len(part.counts), np.int64), [(*names, *material_names)]
-    for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh):
-        if _value(subset.GetElementTypeAttr()) != UsdGeom.Tokens.face:
-            continue
-        faces = _array(subset.GetIndicesAttr(), int)
-        faces = faces[(faces >= 0) & (faces < len(part.counts))]
-        own = (str(subset.GetPath()), subset.GetPrim().GetName())
-        if subset.GetFamilyNameAttr().Get() == UsdShade.Tokens.materialBind:
-            chosen[faces], material_names = looks.number(subset.GetPrim())
-            own = (*own, *material_names)
+    names = [tuple(name for prim in prims for name in (str(prim.GetPath()), prim.GetName()))]
+    groups, chosen = np.zeros(len(part.counts), np.int64), np.full(len(part.counts), -1)
+    for prim, faces, bound in _pieces(mesh, len(part.counts)):
+        own: tuple[str, ...] = () if prim == mesh.GetPrim() else (str(prim.GetPath()), prim.GetName())
+        if bound:
+            chosen[faces], material_names = looks.number(prim)
+            own += material_names
         # What is in several subsets belongs to a group with the names of all of them.
         before, inverse = np.unique(groups[faces], return_inverse=True)
-        groups[faces] = len(found) + inverse
-        found += [(*found[group], *own) for group in before]
-    return replace(part, looks=chosen, groups=groups, names=tuple(found))
+        groups[faces] = len(names) + inverse
+        names += [(*names[group], *own) for group in before]
+    return replace(part, looks=chosen, groups=groups, names=tuple(names))
+
+
+def _pieces(mesh: UsdGeom.Mesh, face_count: int) -> Iterator[tuple[Usd.Prim, np.ndarray, bool]]:
+    """Yield what faces belong to: the prim, its faces, int64 [count], and whether they have its material."""
+    bare = np.ones(face_count, bool)
+    for subset in UsdGeom.Subset.GetAllGeomSubsets(mesh):
+        faces = _array(subset.GetIndicesAttr(), int)
+        faces = faces[(faces >= 0) & (faces < face_count)]
+        if len(faces) and _value(subset.GetElementTypeAttr()) == UsdGeom.Tokens.face:
+            bound = subset.GetFamilyNameAttr().Get() == UsdShade.Tokens.materialBind
+            bare[faces] &= not bound
+            yield subset.GetPrim(), faces, bound
+    if bare.any():
+        yield mesh.GetPrim(), np.flatnonzero(bare), True
 
 
 def _known(stage: Usd.Stage) -> str:
