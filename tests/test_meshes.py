@@ -69,7 +69,7 @@ FLOAT32 = 2.0**-22
 
 def triangles_of(solid: Solid) -> trimesh.Trimesh:
     """Return a solid as a mesh of triangles."""
-    return trimesh.Trimesh(solid.points, triangulate(solid.points, solid.counts, solid.corners), process=False)
+    return trimesh.Trimesh(solid.points, triangulate(solid.points, solid.counts, solid.corners)[0], process=False)
 
 
 def assert_same(mesh: trimesh.Trimesh, solid: Solid, error: float, factor: float = 1.0) -> None:
@@ -520,7 +520,8 @@ def test_polygons_are_cut_into_triangles_inside(count: int, seed: int) -> None:
     normal = generator.normal(size=3)
     across = np.linalg.svd(normal[None])[2][1:]
     points = outline @ across
-    triangles = triangulate(points, np.array([count]), np.arange(count))
+    triangles, sources = triangulate(points, np.array([count]), np.arange(count))
+    np.testing.assert_array_equal(sources, 0)
     assert len(triangles) == count - 2
     a, b, c = np.moveaxis(points[triangles], 1, 0)
     areas = np.cross(b - a, c - a) @ np.cross(*across) / 2

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 
 class WarpjellyError(Exception):
@@ -37,3 +38,9 @@ def reason(error: Exception) -> str:
     """Return what an error of USD says first, without the place in USD's source that reports it."""
     said = re.search(r" : '(.*?)'\s*$", str(error), re.MULTILINE)
     return said[1] if said else " ".join(str(error).split())
+
+
+def listed(names: Sequence[str], most: int) -> str:
+    """Return names for a message, and how many more there are."""
+    rest = len(names) - most
+    return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")

@@ -1,4 +1,4 @@
-"""Read the triangles of a model file: all its objects, placed, in one mesh.
+"""Read a model file: all its objects, placed, as triangles to voxelise and as polygons to draw.
 
 What a file or its format says about its unit and its up axis is applied: USD and COLLADA files say both, 3MF files say
 their unit and have Z up, glTF is in metres with Y up. OBJ, STL, PLY and OFF say neither and are taken as they are.
@@ -6,23 +6,27 @@ their unit and have Z up, glTF is in metres with Y up. OBJ, STL, PLY and OFF say
 
 from __future__ import annotations
 
-import json
+from dataclasses import dataclass, replace
 from importlib import util
 from pathlib import Path
 
 import numpy as np
 import trimesh
 
-from .errors import SceneError
+from .errors import SceneError, listed
+from .gltffile import read_gltf
+from .looks import Look
 from .polygonfiles import read_obj, read_off, read_ply
-from .polygons import Model, Part, from_polygons, placed
+from .polygons import Model, Part, from_polygons, joined, placed, triangulate
 from .scene import USD_EXTENSIONS
 
 # What can be read with nothing else installed, and what each other format needs besides.
 EXTENSIONS = (".obj", ".stl", ".ply", ".off", ".glb", ".gltf", *USD_EXTENSIONS)
 EXTRA_EXTENSIONS = {".3mf": ("lxml", "networkx"), ".dae": ("collada",)}
 
-_POLYGON_READERS = {".obj": read_obj, ".ply": read_ply, ".off": read_off}
+# So many names of parts are listed where there are more.
+_NAMED = 20
+_READERS = {".obj": read_obj, ".ply": read_ply, ".off": read_off, ".glb": read_gltf, ".gltf": read_gltf}
 _METERS_PER_3MF_UNIT = {
     "micron": 1e-6,
     "millimeter": 1e-3,
@@ -31,8 +35,6 @@ _METERS_PER_3MF_UNIT = {
     "foot": 0.3048,
     "meter": 1.0,
 }
-# Extensions of glTF without which its coordinates mean something else.
-_GLTF_COMPRESSION = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_mesh_quantization"}
 # Rotations that turn one axis, pointing up, into another. What is to the right with X up is at -Y.
 _TURNS = {
     ("X", "Y"): [[0, -1, 0], [1, 0, 0], [0, 0, 1]],
@@ -42,8 +44,44 @@ _TURNS = {
 }
 
 
+@dataclass(frozen=True)
+class LoadedModel:
+    """A model in metres, upright: what is voxelised and what is drawn, from the same numbers."""
+
+    path: Path
+    """The file."""
+    mesh: trimesh.Trimesh
+    """All its triangles, with vertices that are equal made one."""
+    mesh_polygons: np.ndarray
+    """Polygon of the drawing that each triangle of the mesh is cut from, int64 [triangle_count]."""
+    drawing: Part
+    """All its polygons as the file has them."""
+    looks: list[Look]
+    """What the polygons look like, by their ``looks``."""
+
+    def region(self, name: str) -> np.ndarray:
+        """Return the triangles of the mesh that belong to an object, group, node, prim or material, int64 [count].
+
+        Raises:
+            SceneError: no triangle belongs to what is called so.
+        """
+        groups = [group for group, names in enumerate(self.drawing.names) if name in names]
+        triangles = np.flatnonzero(np.isin(self.drawing.groups[self.mesh_polygons], groups))
+        if not len(triangles):
+            present = np.unique(self.drawing.groups).tolist()
+            known = list(dict.fromkeys(known for group in present for known in self.drawing.names[group]))
+            named = f"there are {listed(known, _NAMED)}" if known else "none of its parts has a name"
+            raise SceneError(f"{self.path}: no part of the model is called '{name}'; {named}")
+        return triangles
+
+
 def load_mesh(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> trimesh.Trimesh:
-    """Read all triangles of a model file as one mesh, in metres where the file says its unit.
+    """Read all triangles of a model file as one mesh: what ``load_model`` gives, without what it is drawn with."""
+    return load_model(path, up_axis=up_axis, prim=prim).mesh
+
+
+def load_model(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> LoadedModel:
+    """Read a model file: all its objects, placed, in metres where the file says its unit.
 
     Args:
         path: the file; its extension tells its format.
@@ -76,20 +114,24 @@ def load_mesh(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> tri
     except Exception as error:
         why = " ".join(str(error).split()) or type(error).__name__
         raise SceneError(f"{path}: not a sound {path.suffix} file: {why}") from error
-    return _joined(path, model, up_axis)
+    return _loaded(path, model, up_axis)
 
 
 def _read(path: Path, kind: str, prim: str | None) -> Model:
+    # These take long to import, and COLLADA's reader may not be installed.
     if kind in USD_EXTENSIONS:
         from .usdmodel import read_usd
 
         return read_usd(path, prim)
-    if kind in _POLYGON_READERS:
-        return Model([_POLYGON_READERS[kind](path)])
     if kind == ".dae":
-        return _read_dae(path)
-    if kind in (".glb", ".gltf"):
-        _refuse_compressed(path)
+        from .daefile import read_dae
+
+        return read_dae(path)
+    return _READERS.get(kind, _read_triangles)(path)
+
+
+def _read_triangles(path: Path) -> Model:
+    """Read an STL or a 3MF file, which have triangles without UVs and materials."""
     # Meshes are placed by the nodes of a scene, some of them more than once.
     scene = trimesh.load_scene(path, process=False)
     parts = []
@@ -97,75 +139,36 @@ def _read(path: Path, kind: str, prim: str | None) -> Model:
         matrix, name = scene.graph[node]
         mesh = scene.geometry[name]
         if isinstance(mesh, trimesh.Trimesh):
-            parts.append(placed(Part(np.asarray(mesh.vertices), np.asarray(mesh.faces)), matrix))
-    if kind == ".3mf":
-        # The reader says "millimeters" where the file says nothing.
-        unit = str(scene.metadata["units"]).replace("millimeters", "millimeter")
-        return Model(parts, _METERS_PER_3MF_UNIT[unit], "Z")
-    return Model(parts, up_axis="Y" if kind in (".glb", ".gltf") else "")
+            faces = np.asarray(mesh.faces)
+            part = from_polygons(mesh.vertices, np.full(len(faces), 3), faces.ravel(), names=[(node, name)])
+            parts.append(placed(part, matrix))
+    if path.suffix.lower() != ".3mf":
+        return Model(parts)
+    # The reader says "millimeters" where the file says nothing.
+    unit = str(scene.metadata["units"]).replace("millimeters", "millimeter")
+    return Model(parts, [], _METERS_PER_3MF_UNIT[unit], "Z")
 
 
-def _refuse_compressed(path: Path) -> None:
-    """Refuse glTF files whose meshes are compressed, which would be read as something else.
-
-    Raises:
-        ValueError: they are, or the file is no glTF.
-    """
-    data = path.read_bytes()
-    if data.startswith(b"glTF"):
-        # The header and the length and type of the first chunk, which is the text.
-        data = data[20 : 20 + int.from_bytes(data[12:16], "little")]
-    needed = _GLTF_COMPRESSION.intersection(json.loads(data).get("extensionsRequired", []))
-    if needed:
-        raise ValueError(f"its meshes are compressed with {min(needed)}; save it without")
-
-
-def _joined(path: Path, model: Model, up_axis: str) -> trimesh.Trimesh:
-    """Make one mesh of the parts of a model, in metres."""
-    if not sum(len(part.faces) for part in model.parts):
+def _loaded(path: Path, model: Model, up_axis: str) -> LoadedModel:
+    """Make one drawing and one mesh of the parts of a model, in metres."""
+    if not any((part.counts >= 3).any() for part in model.parts):
         raise SceneError(f"{path}: the mesh has no triangles")
-    offsets = np.cumsum([0, *(len(part.vertices) for part in model.parts)])
-    faces = np.concatenate([part.faces + offset for part, offset in zip(model.parts, offsets, strict=False)])
-    vertices = np.concatenate([part.vertices for part in model.parts])
-    if faces.min() < 0 or faces.max() >= len(vertices):
-        raise SceneError(f"{path}: the mesh has faces with vertices that do not exist")
-    used = np.zeros(len(vertices), bool)
-    used[faces] = True
-    faces = (np.cumsum(used) - 1)[faces]
+    drawing = joined(model.parts)
     with np.errstate(over="ignore"):
-        vertices = vertices[used] * model.unit
+        vertices = drawing.vertices * model.unit
         extent = np.ptp(vertices, axis=0).max()
     if not np.isfinite(extent):
         raise SceneError(f"{path}: the mesh has coordinates that are not finite numbers")
     if not extent > 0:
         raise SceneError(f"{path}: the mesh has no size; all its vertices coincide")
-    if turn := _TURNS.get((model.up_axis, up_axis)):
-        vertices = vertices @ np.array(turn, float).T
+    normals = drawing.normals
+    if rows := _TURNS.get((model.up_axis, up_axis)):
+        turn = np.array(rows, float).T
+        vertices = vertices @ turn
+        normals = None if normals is None else normals @ turn
+    drawing = replace(drawing, vertices=vertices, normals=normals)
+    triangles, polygons = triangulate(vertices, drawing.counts, drawing.corners)
     # Formats that repeat the vertices of every triangle would never be watertight otherwise. They repeat them exactly.
     vertices, number = np.unique(vertices, axis=0, return_inverse=True)
-    return trimesh.Trimesh(vertices, number.reshape(-1)[faces], process=False)
-
-
-def _read_dae(path: Path) -> Model:
-    """Read the polygons of a COLLADA file, placed by its scene."""
-    import collada
-
-    ignored = [collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
-    document = collada.Collada(str(path), ignore=ignored)
-    if document.scene is None:
-        raise SceneError(f"{path}: the mesh has no triangles; the file has no scene")
-    parts = []
-    for geometry in document.scene.objects("geometry"):
-        for primitive in geometry.original.primitives:
-            if isinstance(primitive, collada.polylist.Polylist):
-                counts = primitive.vcounts
-            elif isinstance(primitive, collada.triangleset.TriangleSet):
-                counts = np.full(len(primitive), 3)
-            else:
-                continue
-            if len(counts):
-                vertices = np.asarray(primitive.vertex, float)
-                part = from_polygons(vertices, counts, np.asarray(primitive.vertex_index).ravel())
-                parts.append(placed(part, np.asarray(geometry.matrix, float)))
-    unit = document.assetInfo.unitmeter
-    return Model(parts, 1.0 if unit is None else unit, document.assetInfo.upaxis[0])
+    mesh = trimesh.Trimesh(vertices, number.reshape(-1)[triangles], process=False)
+    return LoadedModel(path, mesh, polygons, drawing, model.looks)

@@ -1,54 +1,132 @@
-"""Read the polygons of OBJ, OFF and PLY files; colours, normals and materials are passed over."""
+"""Read the polygons of OBJ, OFF and PLY files; colours of vertices and faces are passed over."""
 
 from __future__ import annotations
 
+import logging
 import re
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
 
-from .polygons import Part, from_polygons
+from .looks import Look
+from .mtlfile import read_mtl
+from .polygons import Model, from_polygons
+
+log = logging.getLogger("warpjelly")
+
+# How many numbers of a vertex, a texture coordinate and a normal are read, and what stands for no index.
+_OBJ_WIDTHS = {"v": 3, "vt": 2, "vn": 3}
+_NONE = np.iinfo(np.int64).min
 
 _PLY_TYPES = {
     **{"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4"},
     **{"int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4"},
     **{"float": "f4", "double": "f8", "float32": "f4", "float64": "f8"},
 }
+# Names of a vertex's UVs, by the programs that write them.
+_PLY_UVS = (("s", "t"), ("u", "v"), ("texture_u", "texture_v"))
 _PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 
 # A property of an element of a PLY file: its name, its type and, of a list, the type of its length.
 _Property = tuple[str, str, str | None]
 
 
-def read_obj(path: Path) -> Part:
-    """Read the polygons of all objects of an OBJ file.
+def read_obj(path: Path) -> Model:
+    """Read the polygons of all objects of an OBJ file, with their groups and materials.
 
     Raises:
         ValueError: a line is wrong; the message has its number.
     """
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    vertices: list[list[float]] = []
+    tables: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
+    corners: dict[str, list[int]] = {"v": [], "vt": [], "vn": []}
     counts: list[int] = []
-    corners: list[int] = []
+    libraries: list[str] = []
+    # What the next polygons belong to: names by the statement that gave them; groups by number, and what each one is.
+    state: dict[str, tuple[str, ...]] = {"o": (), "g": (), "usemtl": ()}
+    groups: list[int] = []
+    known: dict[tuple[tuple[str, ...], ...], int] = {}
     for number, line in enumerate(text.split("\n"), 1):
         words = (line.split("#", 1)[0] if "#" in line else line).split()
+        kind = words[0] if words else ""
         try:
-            if words[:1] == ["v"]:
-                x, y, z = words[1:4]
-                vertices.append([float(x), float(y), float(z)])
-            elif words[:1] == ["f"]:
-                indices = [int(word.split("/", 1)[0] if "/" in word else word) for word in words[1:]]
-                if 0 in indices:
-                    raise ValueError("vertices are numbered from 1")
-                counts.append(len(indices))
-                # Negative numbers count back from the vertex that was read last.
-                corners += [index - 1 if index > 0 else len(vertices) + index for index in indices]
+            if kind in tables:
+                width = _OBJ_WIDTHS[kind]
+                values = [float(word) for word in words[1 : width + 1]]
+                if len(values) < width:
+                    raise ValueError(f"{kind} needs {width} numbers")
+                tables[kind].append(values)
+            elif kind == "f":
+                counts.append(len(words) - 1)
+                groups.append(known.setdefault(tuple(state.values()), len(known)))
+                for word in words[1:]:
+                    for name, index in zip_longest(tables, word.split("/")[:3], fillvalue=""):
+                        corners[name].append(_obj_index(index, len(tables[name])))
+            elif kind == "g":
+                state["g"] = tuple(words[1:])
+            elif kind in state:
+                state[kind] = (" ".join(words[1:]),)
+            elif kind == "mtllib":
+                libraries.append(" ".join(words[1:]))
         except ValueError as error:
             raise ValueError(f"line {number}: {error}") from error
-    return from_polygons(np.array(vertices, float).reshape(-1, 3), counts, corners)
+    looks = _obj_looks(path, libraries, {name for *_, names in known for name in names})
+    numbers = {look.name: k for k, look in enumerate(looks)}
+    group_looks = np.array([numbers.get("".join(names), -1) for *_, names in known], np.int64)
+    part = from_polygons(
+        np.array(tables["v"], float).reshape(-1, 3),
+        counts,
+        corners["v"],
+        uvs=_at_corners(path, tables["vt"], corners["vt"], "texture coordinates"),
+        normals=_at_corners(path, tables["vn"], corners["vn"], "normals"),
+        looks=group_looks[groups],
+        groups=groups,
+        names=[sum(names, ()) for names in known],
+    )
+    return Model([part], looks)
 
 
-def read_off(path: Path) -> Part:
+def _obj_index(word: str, count: int) -> int:
+    """Return which of the values so far is meant, or _NONE; negative numbers count back from the last one."""
+    if not word:
+        return _NONE
+    index = int(word)
+    if index == 0:
+        raise ValueError("vertices are numbered from 1")
+    return index - 1 if index > 0 else count + index
+
+
+def _obj_looks(path: Path, libraries: list[str], names: set[str]) -> list[Look]:
+    """Read the materials that an OBJ file uses."""
+    looks: dict[str, Look] = {}
+    for library in libraries:
+        # A name may have spaces, and there may be several names.
+        whole = (path.parent / library).exists()
+        for file in [library] if whole else library.split():
+            looks |= {look.name: look for look in read_mtl(path, path.parent / file.replace("\\", "/"))}
+    unknown = sorted(names - looks.keys())
+    if unknown and looks:
+        log.warning("%s: materials that are in none of its files: %s", path, ", ".join(unknown))
+    return [look for name, look in looks.items() if name in names]
+
+
+def _at_corners(path: Path, values: list[list[float]], indices: list[int], name: str) -> np.ndarray | None:
+    """Return the value at each corner, NaN where there is none; None where there is none at all."""
+    numbers, table = np.array(indices, np.int64), np.array(values, float)
+    sound = (numbers >= 0) & (numbers < len(table))
+    if lost := int(np.count_nonzero(~sound & (numbers != _NONE))):
+        log.warning("%s: %d corners have %s that do not exist", path, lost, name)
+    if not sound.any():
+        return None
+    found = np.full((len(numbers), table.shape[1]), np.nan)
+    found[sound] = table[numbers[sound]]
+    return found
+
+
+def read_off(path: Path) -> Model:
     """Read the polygons of an OFF file.
 
     Raises:
@@ -70,10 +148,10 @@ def read_off(path: Path) -> Part:
     corners = [int(word) for words, count in zip(faces, counts, strict=True) for word in words[1 : count + 1]]
     if len(corners) != sum(counts):
         raise ValueError("a face has fewer vertices than it says")
-    return from_polygons(vertices, counts, corners)
+    return Model([from_polygons(vertices, counts, corners)])
 
 
-def read_ply(path: Path) -> Part:
+def read_ply(path: Path) -> Model:
     """Read the polygons of a PLY file, text or binary.
 
     Raises:
@@ -88,14 +166,24 @@ def read_ply(path: Path) -> Part:
     rest = data[header.end() :]
     body = np.array(rest.split(), float) if order == "=" else np.frombuffer(rest, np.uint8)
     vertices, counts, corners = np.zeros((0, 3)), np.zeros(0, np.int64), np.zeros(0, np.int64)
+    normals = uvs = None
     at = 0
     for name, count, properties in elements:
         values, at = _ply_element(body, at, count, properties, order)
         if name == "vertex":
-            vertices = np.stack([np.asarray(values[axis][1], float) for axis in "xyz"], axis=1)
+            vertices = _ply_columns(values, ("x", "y", "z"))
+            normals = _ply_columns(values, ("nx", "ny", "nz")) if "nx" in values else None
+            uvs = next((_ply_columns(values, pair) for pair in _PLY_UVS if values.keys() >= {*pair}), None)
         elif name == "face":
             counts, corners = values["vertex_indices" if "vertex_indices" in values else "vertex_index"]
-    return from_polygons(vertices, counts, corners)
+    part = from_polygons(vertices, counts, corners)
+    uvs, normals = (None if values is None else values[part.corners] for values in (uvs, normals))
+    return Model([replace(part, uvs=uvs, normals=normals)])
+
+
+def _ply_columns(values: dict[str, tuple[np.ndarray, np.ndarray]], names: Sequence[str]) -> np.ndarray:
+    """Return some properties of all vertices, float64 [vertex_count, len(names)]."""
+    return np.stack([np.asarray(values[name][1], float) for name in names], axis=1)
 
 
 def _ply_header(text: str) -> tuple[str, list[tuple[str, int, list[_Property]]]]:

@@ -1,0 +1,83 @@
+"""What a surface looks like: the inputs of a UsdPreviewSurface, as numbers, colours and textures."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Self
+
+log = logging.getLogger("warpjelly")
+
+
+@dataclass(frozen=True)
+class Placing:
+    """Where in an image a UV is: it is scaled, turned, and then moved, as by a UsdTransform2d."""
+
+    rotation: float = 0.0
+    """Counterclockwise [deg]."""
+    scale: tuple[float, float] = (1.0, 1.0)
+    translation: tuple[float, float] = (0.0, 0.0)
+
+
+@dataclass(frozen=True)
+class Texture:
+    """An image that gives an input its values, at the UVs of the corners; v points up in it."""
+
+    name: str
+    """Name of a file for it."""
+    data: bytes
+    """Content of that file: PNG, JPEG or what else a viewer reads."""
+    channel: str = "rgb"
+    """What of the image is taken: rgb, r, g, b or a."""
+    srgb: bool = False
+    """Whether its colours are in sRGB; otherwise its values are taken as they are."""
+    wrap: tuple[str, str] = ("repeat", "repeat")
+    """What is beyond the image along u and v: repeat, clamp, mirror or black."""
+    scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
+    """Factors of red, green, blue and alpha."""
+    bias: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
+    """What is added to them thereafter."""
+    placing: Placing = Placing()
+
+    def of(self, channel: str) -> Self:
+        """Return another channel of the same texture."""
+        return replace(self, channel=channel)
+
+
+# What an input can be: a number, a colour or what an image says.
+Value = float | tuple[float, float, float] | Texture
+
+
+@dataclass(frozen=True)
+class Look:
+    """A material."""
+
+    name: str
+    inputs: Mapping[str, Value]
+    """Named as those of a UsdPreviewSurface; colours are linear. What is not here has the default."""
+
+
+# Scale and bias of a map whose colours from 0 to 1 are normals from -1 to 1.
+NORMAL_SCALE, NORMAL_BIAS = (2.0, 2.0, 2.0, 1.0), (-1.0, -1.0, -1.0, 0.0)
+
+
+def shininess_roughness(exponent: float) -> float:
+    """Return the roughness of a UsdPreviewSurface whose highlights are as wide as Blinn's with an exponent."""
+    return (2.0 / (max(exponent, 0.0) + 2.0)) ** 0.25
+
+
+def image_file(model: Path, name: str) -> tuple[str, bytes] | None:
+    """Read an image file that a model names; beside the model, too, where the path belongs to another machine.
+
+    Returns:
+        The name of the file and what is in it; None, after a warning, if it cannot be read.
+    """
+    path = Path(name.replace("\\", "/"))
+    try:
+        beside = model.parent / path
+        return path.name, (beside if beside.exists() else model.parent / path.name).read_bytes()
+    except OSError as error:
+        log.warning("%s: the texture %s cannot be read: %s", model, name, error.strerror)
+        return None

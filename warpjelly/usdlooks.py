@@ -1,0 +1,178 @@
+"""Read looks from the materials of a stage, and write them as such."""
+
+from __future__ import annotations
+
+import logging
+import re
+from pathlib import Path
+from typing import Any
+
+from pxr import Ar, Gf, Sdf, Usd, UsdShade
+
+from .looks import Look, Placing, Texture, Value
+
+log = logging.getLogger("warpjelly")
+
+# Inputs of UsdPreviewSurface that are read and written.
+_TYPES = {
+    **dict.fromkeys(("diffuseColor", "emissiveColor", "specularColor"), Sdf.ValueTypeNames.Color3f),
+    **dict.fromkeys(("roughness", "metallic", "clearcoat", "clearcoatRoughness"), Sdf.ValueTypeNames.Float),
+    **dict.fromkeys(("opacity", "opacityThreshold", "ior", "occlusion"), Sdf.ValueTypeNames.Float),
+    "normal": Sdf.ValueTypeNames.Normal3f,
+    "useSpecularWorkflow": Sdf.ValueTypeNames.Int,
+}
+_COLORS = {"diffuseColor", "emissiveColor", "specularColor"}
+_WRAPS = {"repeat", "clamp", "mirror", "black"}
+
+
+def read_look(file: Path, material: UsdShade.Material) -> Look | None:
+    """Read a material that is a UsdPreviewSurface; None, after a warning, if it is another one.
+
+    Args:
+        file: the stage, for warnings.
+        material: the material.
+    """
+    shader, path = material.ComputeSurfaceSource()[0], material.GetPath()
+    if not shader or shader.GetShaderId() != "UsdPreviewSurface":
+        log.warning("%s: material %s is left out, because it is not a UsdPreviewSurface", file, path)
+        return None
+    values = {name: _look_value(file, shader, name) for name in _TYPES}
+    return Look(path.name, {name: value for name, value in values.items() if value is not None})
+
+
+def _look_value(file: Path, shader: UsdShade.Shader, name: str) -> Value | None:
+    """Return what an input of a surface is; None if it has the default."""
+    source = _source(shader, name)
+    if not source:
+        return None
+    if UsdShade.Utils.GetType(source.GetName()) == UsdShade.AttributeType.Output:
+        return _texture(file, source, name)
+    value = _value(source)
+    return tuple(value) if isinstance(value, Gf.Vec3f) else value
+
+
+def _texture(file: Path, output: Usd.Attribute, name: str) -> Texture | None:
+    """Read the texture that gives an input its value; None, after a warning, if there is none to be had."""
+    shader = UsdShade.Shader(output.GetPrim())
+    if shader.GetShaderId() != "UsdUVTexture":
+        log.warning("%s: %s is left out, because it is not a UsdUVTexture", file, shader.GetPath())
+        return None
+    asset = _input(shader, "file", Sdf.AssetPath())
+    image = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(asset.resolvedPath)) if asset.resolvedPath else None
+    if not image:
+        log.warning("%s: %s: the texture %s is missing", file, shader.GetPath(), asset.path)
+        return None
+    space = _input(shader, "sourceColorSpace", "auto")
+    wraps = (_input(shader, key, "repeat") for key in ("wrapS", "wrapT"))
+    along_u, along_v = (wrap if wrap in _WRAPS else "repeat" for wrap in wraps)
+    return Texture(
+        re.split(r"[/\\\[\]]", asset.path.rstrip("]"))[-1],
+        bytes(image.GetBuffer()),
+        UsdShade.Output(output).GetBaseName(),
+        space == "sRGB" or (space == "auto" and name in _COLORS),
+        (along_u, along_v),
+        tuple(_input(shader, "scale", (1.0, 1.0, 1.0, 1.0))),
+        tuple(_input(shader, "bias", (0.0, 0.0, 0.0, 0.0))),
+        _placing(shader),
+    )
+
+
+def _placing(texture: UsdShade.Shader) -> Placing:
+    """Return what is done to the UVs of a texture."""
+    source = _source(texture, "st")
+    shader = UsdShade.Shader(source.GetPrim()) if source else None
+    if not shader or shader.GetShaderId() != "UsdTransform2d":
+        return Placing()
+    along_u, along_v = _input(shader, "scale", (1.0, 1.0))
+    return Placing(
+        _input(shader, "rotation", 0.0), (along_u, along_v), tuple(_input(shader, "translation", (0.0, 0.0)))
+    )
+
+
+def _source(shader: UsdShade.Shader, name: str) -> Usd.Attribute | None:
+    """Return the attribute that an input has its value from, through all that is connected."""
+    shader_input = shader.GetInput(name)
+    return next(iter(UsdShade.Utils.GetValueProducingAttributes(shader_input)), None) if shader_input else None
+
+
+def _input(shader: UsdShade.Shader, name: str, default: Any) -> Any:
+    source = _source(shader, name)
+    value = _value(source) if source else None
+    return default if value is None else value
+
+
+def _value(attribute: Usd.Attribute) -> Any:
+    """Return the value at rest."""
+    value = attribute.Get()
+    return attribute.Get(Usd.TimeCode.EarliestTime()) if value is None else value
+
+
+def define_look(stage: Usd.Stage, path: Sdf.Path, look: Look, texture_folder: Path) -> UsdShade.Material:
+    """Write a look as a material whose textures are at the primvar ``st``.
+
+    Args:
+        stage: the stage, which is saved or exported beside the folder.
+        path: where the material will be.
+        look: what it is.
+        texture_folder: where its images are written, as files that several looks share where they are equal.
+
+    Raises:
+        OSError: an image cannot be written.
+    """
+    material = UsdShade.Material.Define(stage, path)
+    surface = UsdShade.Shader.Define(stage, material.GetPath().AppendChild("surface"))
+    surface.CreateIdAttr("UsdPreviewSurface")
+    material.CreateSurfaceOutput().ConnectToSource(surface.ConnectableAPI(), "surface")
+    shaders: dict[Texture, UsdShade.Shader] = {}
+    for name, value in look.inputs.items():
+        shader_input = surface.CreateInput(name, _TYPES[name])
+        if not isinstance(value, Texture):
+            shader_input.Set(Gf.Vec3f(*value) if isinstance(value, tuple) else value)
+            continue
+        image = value.of("rgb")
+        if image not in shaders:
+            file = f"./{texture_folder.name}/{_written(texture_folder, image)}"
+            shaders[image] = _define_texture(material, f"{name}_texture", image, file)
+        kind = Sdf.ValueTypeNames.Float3 if value.channel == "rgb" else Sdf.ValueTypeNames.Float
+        shader_input.ConnectToSource(shaders[image].CreateOutput(value.channel, kind))
+    return material
+
+
+def _define_texture(material: UsdShade.Material, name: str, texture: Texture, file: str) -> UsdShade.Shader:
+    stage, path = material.GetPrim().GetStage(), material.GetPath()
+    types = Sdf.ValueTypeNames
+    reader = UsdShade.Shader.Define(stage, path.AppendChild("st"))
+    reader.CreateIdAttr("UsdPrimvarReader_float2")
+    reader.CreateInput("varname", types.String).Set("st")
+    uvs = reader.CreateOutput("result", types.Float2)
+    if texture.placing != Placing():
+        transform = UsdShade.Shader.Define(stage, path.AppendChild(f"{name}_placing"))
+        transform.CreateIdAttr("UsdTransform2d")
+        transform.CreateInput("in", types.Float2).ConnectToSource(uvs)
+        transform.CreateInput("rotation", types.Float).Set(texture.placing.rotation)
+        transform.CreateInput("scale", types.Float2).Set(Gf.Vec2f(*texture.placing.scale))
+        transform.CreateInput("translation", types.Float2).Set(Gf.Vec2f(*texture.placing.translation))
+        uvs = transform.CreateOutput("result", types.Float2)
+    shader = UsdShade.Shader.Define(stage, path.AppendChild(name))
+    shader.CreateIdAttr("UsdUVTexture")
+    shader.CreateInput("st", types.Float2).ConnectToSource(uvs)
+    shader.CreateInput("file", types.Asset).Set(file)
+    shader.CreateInput("sourceColorSpace", types.Token).Set("sRGB" if texture.srgb else "raw")
+    for key, wrap in zip(("wrapS", "wrapT"), texture.wrap, strict=True):
+        shader.CreateInput(key, types.Token).Set(wrap)
+    shader.CreateInput("scale", types.Float4).Set(Gf.Vec4f(*texture.scale))
+    shader.CreateInput("bias", types.Float4).Set(Gf.Vec4f(*texture.bias))
+    return shader
+
+
+def _written(folder: Path, texture: Texture) -> str:
+    """Write an image into a folder, unless it is there, and return the name of its file."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for file in sorted(folder.iterdir()):
+        if file.is_file() and file.stat().st_size == len(texture.data) and file.read_bytes() == texture.data:
+            return file.name
+    name = Path(re.sub(r"[^\w.-]+", "_", texture.name, flags=re.ASCII).lstrip(".") or "texture")
+    names = [name.name, *(f"{name.stem}_{k}{name.suffix}" for k in range(1, 1 + sum(1 for _ in folder.iterdir())))]
+    file = folder / next(one for one in names if not (folder / one).exists())
+    file.write_bytes(texture.data)
+    return file.name
