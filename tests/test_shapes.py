@@ -9,15 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 import trimesh
-from pxr import Usd, UsdGeom
+from PIL import Image
+from pxr import Usd, UsdGeom, UsdShade
 from worlds import make_scene
 
 from warpjelly.colors import KIND_COLORS
-from warpjelly.drawing import Drawing
 from warpjelly.embedding import containing_cells, embed, face_cells
 from warpjelly.lattice import Lattice, build_lattice
+from warpjelly.polygons import Part, from_polygons
+from warpjelly.preview import render_preview
 from warpjelly.run import simulate
 from warpjelly.scene import Output
+from warpjelly.shading import shared_normals
 from warpjelly.shapes import Shape, shapes_of
 from warpjelly.simulator import Simulator
 from warpjelly.usd import open_stage
@@ -202,12 +205,69 @@ def test_an_embedded_model_at_rest_is_the_original(tmp_path: Path, precision: st
     )
     simulator = Simulator(scene, device="cpu")
     (shape,), (sample,) = simulator.model.shapes, simulator.shapes()
-    assert shape.name == "surface"
-    triangles = sample.points[shape.corners.reshape(-1, 3)]
-    assert len(triangles) == len(mesh.faces)
-    found = triangles[np.lexsort(triangles.mean(axis=1).T.round(4))]
-    expected = mesh.triangles[np.lexsort(mesh.triangles.mean(axis=1).T.round(4))]
-    np.testing.assert_allclose(found.mean(axis=1), expected.mean(axis=1), rtol=0, atol=1e-6)
+    assert (shape.counts == 3).all()
+    np.testing.assert_array_equal(shape.corners.reshape(-1, 3), mesh.faces)
+    # The model is 1 m large and 4 m away, where float32 is exact to 2.4e-7 m.
+    np.testing.assert_allclose(sample.points, mesh.vertices, rtol=0, atol=1e-6)
+
+
+def write_painted_box(folder: Path) -> Path:
+    """Write a box of quads with UVs, half of it textured, half of one colour, and the rest without a material."""
+    Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "red.png")
+    (folder / "box.mtl").write_text("newmtl painted\nmap_Kd red.png\nnewmtl green wood\nKd 0.0 0.5 0.0\n")
+    vertices = [f"v {x} {y} {z}" for x, y, z in BOX]
+    uvs = [f"vt {u} {v}" for u, v in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    looks = ["usemtl painted", "", "usemtl green wood", "", "usemtl unknown", ""]
+    faces = []
+    for look, quad in zip(looks, BOX_QUADS, strict=True):
+        faces += [look, "f " + " ".join(f"{corner + 1}/{k + 1}" for k, corner in enumerate(quad))]
+    (folder / "box.obj").write_text("\n".join(["mtllib box.mtl", *vertices, *uvs, *faces]) + "\n")
+    return folder / "box.obj"
+
+
+@pytest.mark.parametrize("look", ["model", "force"])
+def test_a_stage_has_the_uvs_and_materials_of_the_model(tmp_path: Path, look: str) -> None:
+    """Write polygons, UVs and materials as the file has them, textures beside the stage; or colours of forces."""
+    model = write_painted_box(tmp_path)
+    simulate(model_scene(model, look=look), output=tmp_path / "run", device="cpu")
+    assert stage_problems(tmp_path / "run") == []
+    stage = open_stage(tmp_path / "run")
+    mesh = UsdGeom.Mesh(stage.GetPrimAtPath("/World/bodies/ball/surface"))
+    assert list(mesh.GetFaceVertexCountsAttr().Get()) == [4] * 6
+    np.testing.assert_array_equal(mesh.GetFaceVertexIndicesAttr().Get(), np.ravel(BOX_QUADS))
+    np.testing.assert_allclose(mesh.GetPointsAttr().Get(), BOX, rtol=0, atol=1e-6)
+    uvs = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("st").ComputeFlattened()
+    np.testing.assert_array_equal(uvs, [[0, 0], [1, 0], [1, 1], [0, 1]] * 6)
+    subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+    if look == "force":
+        assert not subsets and not (tmp_path / "run" / "textures").exists()
+        return
+    assert [list(subset.GetIndicesAttr().Get()) for subset in subsets] == [[0, 1], [2, 3]]
+    shaders = []
+    for subset in subsets:
+        material = UsdShade.MaterialBindingAPI(subset.GetPrim()).ComputeBoundMaterial()[0]
+        shaders.append(material.ComputeSurfaceSource()[0])
+    np.testing.assert_allclose(shaders[1].GetInput("diffuseColor").Get(), [0.0, 0.5, 0.0])
+    texture = UsdShade.Shader(shaders[0].GetInput("diffuseColor").GetConnectedSources()[0][0].source.GetPrim())
+    asset = texture.GetInput("file").Get()
+    assert asset.path == "./textures/red.png"
+    assert Path(asset.resolvedPath).read_bytes() == (tmp_path / "red.png").read_bytes()
+    (tmp_path / "run" / "textures" / "red.png").unlink()
+    assert stage_problems(tmp_path / "run") == ["stage.usdc: missing file ./textures/red.png"]
+    # What has no material shows forces, as all of it does for readers that know none.
+    assert UsdShade.MaterialBindingAPI(mesh).ComputeBoundMaterial()[0].GetPath() == "/World/looks/jelly"
+    assert mesh.GetDisplayColorPrimvar().ValueMightBeTimeVarying()
+
+
+@pytest.mark.egl
+def test_a_picture_shows_the_materials_of_the_model(tmp_path: Path) -> None:
+    """Find the red of the texture and the green of the material in the picture."""
+    simulate(model_scene(write_painted_box(tmp_path)), output=tmp_path / "run", device="cpu")
+    render_preview(tmp_path / "run", tmp_path / "p.png", frames=[0], size=(320, 240))
+    with Image.open(tmp_path / "p.png") as picture:
+        red, green, blue = np.asarray(picture.convert("RGB")).astype(int).reshape(-1, 3).T
+    assert ((red > 100) & (green < red / 3) & (blue < red / 3)).any()
+    assert ((green > 60) & (red < green / 2) & (blue < green / 2)).any()
 
 
 def test_an_embedded_model_goes_where_its_lattice_goes(tmp_path: Path) -> None:
@@ -266,28 +326,30 @@ def test_springs_and_particles_are_shown_where_asked(tmp_path: Path) -> None:
     assert Counter(kind.tolist()) == {0: 54, 1: 72 + 32, 3: 27}
 
 
-def box_drawing(**changes: Any) -> Drawing:
+BOX = np.array(list(np.ndindex(2, 2, 2)), float)
+BOX_QUADS = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
+
+
+def box(normals: np.ndarray | None = None) -> Part:
     """Return a cube of six quads."""
-    vertices = np.array(list(np.ndindex(2, 2, 2)), float)
-    quads = [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    return Drawing(**{"vertices": vertices, "counts": np.full(6, 4), "corners": np.ravel(quads), **changes})
+    return from_polygons(BOX, np.full(6, 4), np.ravel(BOX_QUADS), normals=normals)
 
 
 def test_creases_stay_hard_and_the_rest_smooth() -> None:
     """Share normals across shallow edges and across repeated vertices, not across steep ones."""
-    assert len(np.unique(box_drawing().shading())) == 24
+    assert len(np.unique(shared_normals(box()))) == 24
     ball = trimesh.creation.icosphere(subdivisions=3)
-    smooth = Drawing(ball.vertices, np.full(len(ball.faces), 3), ball.faces.ravel())
-    assert len(np.unique(smooth.shading())) == len(ball.vertices)
+    threes = np.full(len(ball.faces), 3)
+    smooth = shared_normals(from_polygons(ball.vertices, threes, ball.faces.ravel()))
+    assert len(np.unique(smooth)) == len(ball.vertices)
     # As formats write it that repeat vertices.
-    loose = Drawing(ball.vertices[ball.faces.ravel()], np.full(len(ball.faces), 3), np.arange(ball.faces.size))
-    np.testing.assert_array_equal(loose.shading(), smooth.shading())
+    loose = from_polygons(ball.vertices[ball.faces.ravel()], threes, np.arange(ball.faces.size))
+    np.testing.assert_array_equal(shared_normals(loose), smooth)
 
 
 def test_a_models_own_normals_say_what_is_smooth() -> None:
     """Share a normal where the file has the same one for a vertex."""
-    drawing = box_drawing()
-    outward = (drawing.vertices[drawing.corners] - 0.5) / np.sqrt(0.75)
-    assert len(np.unique(box_drawing(normals=outward).shading())) == 8
-    flat = np.repeat(np.eye(3), 8, axis=0)
-    assert len(np.unique(box_drawing(normals=flat).shading())) == 24
+    outward = (BOX[np.ravel(BOX_QUADS)] - 0.5) / np.sqrt(0.75)
+    assert len(np.unique(shared_normals(box(outward)))) == 8
+    flat = np.repeat(np.eye(3)[[0, 0, 1, 1, 2, 2]] * np.array([-1, 1, -1, 1, -1, 1])[:, None], 4, axis=0)
+    assert len(np.unique(shared_normals(box(flat)))) == 24

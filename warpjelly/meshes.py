@@ -59,6 +59,12 @@ class LoadedModel:
     looks: list[Look]
     """What the polygons look like, by their ``looks``."""
 
+    def scaled(self, factor: float) -> LoadedModel:
+        """Return the model made larger by a factor, from the origin."""
+        mesh, drawing = self.mesh.copy(), replace(self.drawing, vertices=self.drawing.vertices * factor)
+        mesh.vertices *= factor
+        return replace(self, mesh=mesh, drawing=drawing)
+
     def region(self, name: str) -> np.ndarray:
         """Return the triangles of the mesh that belong to an object, group, node, prim or material, int64 [count].
 

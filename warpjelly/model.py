@@ -156,7 +156,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         classes.append(spring_classes(material, lattice))
         chunks.append(np.arange(particle_count, particle_count + count, CHUNK_SIZE, dtype=np.int32))
         chunk_bodies.append(np.full(len(chunks[-1]), number, np.int32))
-        shapes += shapes_of(str(body.name), lattice, scene.output, body_plan.drawing)
+        shapes += shapes_of(str(body.name), lattice, scene.output, body_plan.model)
         shape_starts += [particle_count] * (len(shapes) - len(shape_starts))
         bodies.append(
             Body(

@@ -5,20 +5,20 @@ from __future__ import annotations
 import logging
 import os
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .drawing import Drawing
 from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
 from .network import build_cloth, build_network
 from .scene import MAX_LENGTH, MIN_LENGTH, AnyBody, ClothBody, CubeBody, ModelBody, NetworkBody, Scene
 
 if TYPE_CHECKING:
+    from .meshes import LoadedModel
     from .voxelize import VoxelGrid
 
 log = logging.getLogger("warpjelly")
@@ -57,7 +57,7 @@ class BodyPlan:
     """Number of jelly cubes."""
     grid_size: int = 0
     """Number of cells of its grid, occupied or not."""
-    drawing: Drawing | None = None
+    model: LoadedModel | None = None
     """The model that it is made from, where it is to be seen."""
 
 
@@ -119,14 +119,14 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         particles = body.particles[0] * body.particles[1]
         build = partial(build_cloth, body.size, body.particles)
         return BodyPlan(body, build, particles, 6 * particles, 6 * particles, particles)
-    drawing = None
+    model = None
     if isinstance(body, CubeBody):
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
     elif isinstance(body, ModelBody):
-        model = voxelize_model(body, up_axis=scene.up_axis)
-        cells, origin, cell_size = model.grid.cells, model.grid.origin, model.grid.cell_size
-        drawing = model.drawing if scene.output.surface == "model" else None
+        voxelized = voxelize_model(body, up_axis=scene.up_axis)
+        cells, origin, cell_size = voxelized.grid.cells, voxelized.grid.origin, voxelized.grid.cell_size
+        model = voxelized.model if scene.output.surface == "model" else None
     else:
         cells, origin, cell_size = body.grid()
     per_edge = body.particles_per_edge
@@ -139,7 +139,7 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         weighted=scene.materials[body.material].law == "young",
     )
     counts = count_lattice(cells, particles_per_edge=per_edge)
-    return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size, drawing)
+    return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size, model)
 
 
 @dataclass(frozen=True)
@@ -149,8 +149,8 @@ class VoxelizedModel:
     grid: VoxelGrid
     """In metres."""
     watertight: bool
-    drawing: Drawing
-    """The model in the frame of the body."""
+    model: LoadedModel
+    """What it was made from, in the frame of the body."""
     mesh_volume: float
     """m^3; of a closed mesh that does not intersect itself, the volume inside."""
     warnings: list[str]
@@ -168,14 +168,16 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
         InputError: the model cannot be used.
     """
     # These imports take most of a second, which scenes without models need not spend.
-    from .meshes import load_mesh
+    from .meshes import load_model
     from .voxelize import voxelize, voxelize_mesh
 
-    mesh = load_mesh(body.file, up_axis=up_axis, prim=body.prim)
+    model = load_model(body.file, up_axis=up_axis, prim=body.prim)
     scale = 1.0 if body.scale is None else body.scale
     if body.fit is not None:
-        mesh.vertices *= body.fit / mesh.extents.max()
-    largest = mesh.extents.max() * scale
+        scale = body.fit / model.mesh.extents.max()
+    model = model.scaled(scale)
+    mesh = model.mesh
+    largest = mesh.extents.max()
     if not MIN_LENGTH <= largest <= MAX_LENGTH:
         raise SceneError(
             f"{body.file}: the model is {largest:.3g} m large; between {MIN_LENGTH:g} and {MAX_LENGTH:g} m can be "
@@ -197,11 +199,9 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
         )
     for note in notes:
         log.warning("%s: %s", body.file, note)
-    in_metres = replace(grid, origin=grid.origin * scale, cell_size=grid.cell_size * scale)
     # By the divergence theorem.
-    volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6 * scale**3
-    drawing = Drawing(mesh.vertices * scale, np.full(len(mesh.faces), 3), mesh.faces.ravel())
-    return VoxelizedModel(in_metres, bool(mesh.is_watertight), drawing, volume, notes)
+    volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6
+    return VoxelizedModel(grid, bool(mesh.is_watertight), model, volume, notes)
 
 
 def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
@@ -214,19 +214,19 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
 
     (body,) = scene.bodies
     assert isinstance(body, ModelBody)
-    model = voxelize_model(body, up_axis=scene.up_axis)
-    grid = model.grid
+    voxelized = voxelize_model(body, up_axis=scene.up_axis)
+    grid = voxelized.grid
     lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
     return grid, {
         "voxels": int(np.count_nonzero(grid.cells)),
         "particles": len(lattice.particles),
         "springs": lattice.spring_count,
         "pieces": len(find_pieces(grid.cells)[1]),
-        "watertight": model.watertight,
+        "watertight": voxelized.watertight,
         "method": grid.method,
         "volume": grid.volume,
-        "mesh_volume": model.mesh_volume,
-        "warnings": model.warnings,
+        "mesh_volume": voxelized.mesh_volume,
+        "warnings": voxelized.warnings,
     }
 
 

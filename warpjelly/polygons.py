@@ -106,7 +106,7 @@ def placed(part: Part, matrix: np.ndarray) -> Part:
         a, b, c = matrix[:3, :3]
         # The inverse transpose times the determinant, which exists for flat ones, too.
         cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
-        moved = replace(moved, normals=_unit(part.normals @ cofactors.T * (-1.0 if mirrored else 1.0)))
+        moved = replace(moved, normals=unit(part.normals @ cofactors.T * (-1.0 if mirrored else 1.0)))
     return moved.turned_round() if mirrored else moved
 
 
@@ -147,7 +147,7 @@ def _filled(arrays: Sequence[np.ndarray | None], parts: Sequence[Part], width: i
 
 def _sound_normals(part: Part, normals: np.ndarray) -> np.ndarray:
     """Return normals of length 1, with that of the polygon where there is none."""
-    normals = _unit(normals)
+    normals = unit(normals)
     missing = ~normals.any(axis=1)
     if missing.any():
         starts = np.cumsum(part.counts) - part.counts
@@ -156,11 +156,11 @@ def _sound_normals(part: Part, normals: np.ndarray) -> np.ndarray:
         turns = np.cross(arms[:-1], arms[1:])
         # What turns from the last corner of a polygon to the first one of the next is 0, whose arm is.
         planes = np.add.reduceat(np.concatenate([turns, np.zeros((1, 3))]), starts)
-        normals[missing] = np.repeat(_unit(planes), part.counts, axis=0)[missing]
+        normals[missing] = np.repeat(unit(planes), part.counts, axis=0)[missing]
     return normals
 
 
-def _unit(vectors: np.ndarray) -> np.ndarray:
+def unit(vectors: np.ndarray) -> np.ndarray:
     """Make vectors [count, 3] as long as 1, but for those of no length."""
     lengths = np.linalg.norm(vectors, axis=1, keepdims=True)
     return np.divide(vectors, lengths, out=np.zeros_like(vectors), where=lengths > 0)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +15,7 @@ from pxr import Usd, UsdGeom
 from .colors import SRGB_TABLE, srgb_from_linear
 from .errors import EnvironmentFailedError, InputError
 from .files import whole_file
+from .solids import Drawn, draw_stage, shapes_in
 from .usd import open_stage
 from .validate import stage_problems
 
@@ -69,8 +70,12 @@ def render_preview(
     if len(shown) * size[0] * size[1] > MAX_PIXELS:
         raise InputError(f"{len(shown)} frames of {size[0]}x{size[1]}: more than {MAX_PIXELS:,} pixels")
     pyvista = require_pyvista()
-    panels = [_render(pyvista, stage, frame, size) for frame in shown]
-    _save(_laid_out(stage, shown, panels), output)
+    panels, legend = [], False
+    for frame in shown:
+        drawn = draw_stage(pyvista, stage, frame)
+        panels.append(_render(pyvista, stage, drawn, frame, size))
+        legend = any(solid.shows_force for solid in drawn.solids)
+    _save(_laid_out(stage, shown, panels, with_legend=legend), output)
 
 
 def require_pyvista() -> Any:
@@ -112,44 +117,16 @@ def _chosen_frames(stage: Usd.Stage, source: Path, frames: Sequence[int] | None)
 def _brightest_frame(stage: Usd.Stage, first: int, last: int) -> int:
     """Return the frame with the brightest bodies: along the colour map, that is the one with the greatest forces."""
     brightness = np.zeros(last - first + 1)
-    for mesh in _shapes(stage, UsdGeom.PointBased):
+    for mesh in shapes_in(stage, UsdGeom.PointBased):
         primvar = UsdGeom.Primvar(mesh.GetDisplayColorAttr())
         if primvar.ValueMightBeTimeVarying():
             brightness += [np.sum(np.array(primvar.ComputeFlattened(t))[:, 1]) for t in range(first, last + 1)]
     return first + int(np.argmax(brightness))
 
 
-def _shapes(stage: Usd.Stage, schema: Any) -> Iterator[Any]:
-    return (schema(prim) for prim in stage.Traverse() if prim.IsA(schema))
-
-
-def _render(pyvista: Any, stage: Usd.Stage, frame: int, size: tuple[int, int]) -> np.ndarray:
+def _render(pyvista: Any, stage: Usd.Stage, drawn: Drawn, frame: int, size: tuple[int, int]) -> np.ndarray:
     """Return the picture of one frame, uint8 [height, width, 3]."""
-    transforms = UsdGeom.XformCache(frame)
-
-    def matrix(shape: Any) -> np.ndarray:
-        return np.array(transforms.GetLocalToWorldTransform(shape.GetPrim())).T
-
-    solids: list[pv.PolyData] = []
-    floors: list[pv.PolyData] = []
-    for mesh in _shapes(stage, UsdGeom.Mesh):
-        surface = _surface(pyvista, mesh, frame).transform(matrix(mesh), inplace=False)
-        (floors if surface.n_cells == 1 else solids).append(surface)
-    for sphere in _shapes(stage, UsdGeom.Sphere):
-        ball = pyvista.Sphere(radius=sphere.GetRadiusAttr().Get(frame), theta_resolution=96, phi_resolution=96)
-        ball["color"] = _colors(sphere, frame, ball.n_points)
-        solids.append(ball.transform(matrix(sphere), inplace=False))
-    rooms = []
-    for curves in _shapes(stage, UsdGeom.BasisCurves):
-        points = np.array(curves.GetPointsAttr().Get(frame)).reshape(-1, 3)
-        lines = pyvista.line_segments_from_points(points).transform(matrix(curves), inplace=False)
-        if curves.GetDisplayColorPrimvar().GetInterpolation() != UsdGeom.Tokens.constant:
-            lines["color"] = _colors(curves, frame, len(points))
-            solids.append(lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True))
-        else:
-            rooms.append(lines)
-    for balls in _shapes(stage, UsdGeom.Points):
-        solids.append(_balls(pyvista, balls, frame).transform(matrix(balls), inplace=False))
+    solids, rooms = drawn.solids, drawn.rooms
     if not solids:
         raise InputError("the stage has nothing to show")
 
@@ -162,10 +139,10 @@ def _render(pyvista: Any, stage: Usd.Stage, frame: int, size: tuple[int, int]) -
             light.position, light.focal_point, light.positional = direction @ axes, (0, 0, 0), False
             plotter.add_light(light)
         for solid in solids:
+            colors = {"scalars": "color", "rgb": True} if solid.texture is None else {"texture": solid.texture}
             actor = plotter.add_mesh(
-                solid,
-                scalars="color",
-                rgb=True,
+                solid.surface,
+                **colors,
                 smooth_shading=True,
                 split_sharp_edges=False,
                 ambient=0.6,
@@ -176,55 +153,17 @@ def _render(pyvista: Any, stage: Usd.Stage, frame: int, size: tuple[int, int]) -
             actor.GetShaderProperty().AddFragmentShaderReplacement(_LIGHT_STEP, True, _GLOW, False)
         for room in rooms:
             plotter.add_mesh(room, color=(0.6, 0.62, 0.66), line_width=2, lighting=False)
-        for floor in floors or [_room_floor(pyvista, stage, room) for room in rooms]:
-            _add_floor(pyvista, plotter, floor, solids, _KEY / np.linalg.norm(_KEY) @ axes)
+        for floor in drawn.floors or [_room_floor(pyvista, stage, room) for room in rooms]:
+            _add_floor(pyvista, plotter, floor, [solid.surface for solid in solids], _KEY / np.linalg.norm(_KEY) @ axes)
         plotter.enable_anti_aliasing("ssaa")
         return np.array(plotter.screenshot(return_img=True))
     finally:
         plotter.close()
 
 
-def _surface(pyvista: Any, mesh: UsdGeom.Mesh, frame: int) -> pv.PolyData:
-    points = np.array(mesh.GetPointsAttr().Get(frame)).reshape(-1, 3)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(frame))
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
-    colors, normals = _colors(mesh, frame, len(points)), mesh.GetNormalsAttr().Get(frame)
-    by_corner = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
-    if by_corner and by_corner.GetInterpolation() == UsdGeom.Tokens.faceVarying:
-        # VTK has normals for points alone, so every corner becomes one.
-        points, colors, normals = points[corners], colors[corners], by_corner.ComputeFlattened(frame)
-        corners = np.arange(len(corners))
-    # VTK wants each face's number of corners in front of them.
-    surface = pyvista.PolyData(points, faces=np.insert(corners, np.cumsum(counts) - counts, counts))
-    if normals is not None and len(normals) == len(points):
-        surface.point_data.active_normals = np.array(normals)
-    surface["color"] = colors
-    return surface
-
-
-def _balls(pyvista: Any, shape: UsdGeom.Points, frame: int) -> pv.PolyData:
-    points = np.array(shape.GetPointsAttr().Get(frame)).reshape(-1, 3)
-    cloud = pyvista.PolyData(points)
-    cloud["color"] = _colors(shape, frame, len(points))
-    ball = pyvista.Icosphere(radius=shape.GetWidthsAttr().Get(frame)[0] / 2, nsub=2)
-    return cloud.glyph(geom=ball, scale=False, orient=False)
-
-
-def _colors(shape: UsdGeom.Gprim, frame: int, count: int) -> np.ndarray:
-    """Return the colour of every point, sRGB, uint8 [count, 3]; grey where the stage has none by point."""
-    linear = UsdGeom.Primvar(shape.GetDisplayColorAttr()).ComputeFlattened(frame)
-    colors = np.array([[0.4, 0.4, 0.4]] if linear is None or not len(linear) else linear)
-    if shape.GetPrim().IsA(UsdGeom.BasisCurves) and 2 * len(colors) == count:
-        # A colour for each straight line, from one point to the next.
-        colors = np.repeat(colors, 2, axis=0)
-    if len(colors) not in (1, count):
-        colors = np.array([[0.4, 0.4, 0.4]])
-    return np.broadcast_to(np.rint(srgb_from_linear(colors) * 255).astype(np.uint8), (count, 3)).copy()
-
-
 def _aim(plotter: Any, stage: Usd.Stage, frame: int, size: tuple[int, int]) -> np.ndarray:
     """Look through the stage's camera; return its axes (right, up, backward) [3, 3]."""
-    camera = next(_shapes(stage, UsdGeom.Camera), None)
+    camera = next(shapes_in(stage, UsdGeom.Camera), None)
     if camera is None:
         raise InputError("the stage has no camera")
     view = camera.GetCamera(frame)
@@ -328,7 +267,7 @@ def _grid_step(distance: float) -> float:
     return float(power * min((1, 2, 5, 10), key=lambda digit: abs(np.log(distance / 10 / power / digit))))
 
 
-def _laid_out(stage: Usd.Stage, frames: list[int], panels: list[np.ndarray]) -> Any:
+def _laid_out(stage: Usd.Stage, frames: list[int], panels: list[np.ndarray], *, with_legend: bool) -> Any:
     """Return the panels side by side with the time below each and the legend beside the last."""
     from PIL import Image, ImageDraw, ImageFont
 
@@ -345,21 +284,42 @@ def _laid_out(stage: Usd.Stage, frames: list[int], panels: list[np.ndarray]) -> 
 
     legend = stage.GetDefaultPrim().GetCustomDataByKey("legend") if stage.GetDefaultPrim() else None
     if legend and height >= 120:
-        low, high = (f"{force:.2g}" for force in legend["range"])
-        caption = f"{legend['quantity']}, {legend['unit']}"
-        # The bar is as wide as its captions need, a line's height between them; the middle one is centred.
-        needed = font.getlength(caption) + 2 * max(font.getlength(low), font.getlength(high)) + 2 * text
-        bar = Image.fromarray(np.rint(SRGB_TABLE[None] * 255).astype(np.uint8))
-        bar = bar.resize((max(width // 5, round(needed)), max(text // 2, 4)))
-        left, top = picture.width - bar.width - text, height - 2 * text - bar.height - 2
-        picture.paste(bar, (left, top))
-        for x, label, anchor in (
-            (left, low, "ls"),
-            (left + bar.width / 2, caption, "ms"),
-            (left + bar.width, high, "rs"),
-        ):
-            draw.text((x, height - text), label, fill=_INK, font=font, anchor=anchor)
+        if with_legend:
+            _draw_force_legend(picture, draw, font, legend, width)
+        _draw_spring_legend(picture, draw, font, legend.get("springs", {}))
     return picture
+
+
+def _draw_force_legend(picture: Any, draw: Any, font: Any, legend: Mapping[str, Any], width: int) -> None:
+    """Draw the colour map of forces into the lower right corner; a frame is ``width`` pixels wide."""
+    from PIL import Image
+
+    text, height = font.size, picture.height
+    low, high = (f"{force:.2g}" for force in legend["range"])
+    caption = f"{legend['quantity']}, {legend['unit']}"
+    # The bar is as wide as its captions need, a line's height between them; the middle one is centred.
+    needed = font.getlength(caption) + 2 * max(font.getlength(low), font.getlength(high)) + 2 * text
+    bar = Image.fromarray(np.rint(SRGB_TABLE[None] * 255).astype(np.uint8))
+    bar = bar.resize((max(width // 5, round(needed)), max(text // 2, 4)))
+    left, top = picture.width - bar.width - text, height - 2 * text - bar.height - 2
+    picture.paste(bar, (left, top))
+    for x, label, anchor in (
+        (left, low, "ls"),
+        (left + bar.width / 2, caption, "ms"),
+        (left + bar.width, high, "rs"),
+    ):
+        draw.text((x, height - text), label, fill=_INK, font=font, anchor=anchor)
+
+
+def _draw_spring_legend(picture: Any, draw: Any, font: Any, colors: Mapping[str, Any]) -> None:
+    """Name the kinds of springs in their colours, linear, in the upper right corner."""
+    text, right = font.size, picture.width - font.size
+    for name, color in reversed(list(colors.items())):
+        draw.text((right, 2 * text), name, fill=_INK, font=font, anchor="rs")
+        right -= round(font.getlength(name)) + text // 2
+        shown = np.rint(srgb_from_linear(np.array(color)) * 255).astype(int)
+        draw.rectangle([right - text // 2, 2 * text - text // 2, right, 2 * text], fill=tuple(shown.tolist()))
+        right -= 3 * text // 2
 
 
 def _save(picture: Any, output: Path) -> None:

@@ -672,6 +672,10 @@ class Output(Table):
         description="what the surface of a body of cells is: the faces of its cells, hard where their directions meet; "
         "the same without steps; or the model that it was made from, deformed",
     )
+    look: Literal["model", "force"] = Field(
+        "model",
+        description="with surface model: the materials of the model, where it has any, or the colours of forces",
+    )
     show: list[Literal["surface", "springs", "particles"]] = Field(
         ["surface"],
         min_length=1,

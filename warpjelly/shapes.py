@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .drawing import Drawing
 from .embedding import containing_cells, embed, face_cells
 from .lattice import Lattice
+from .shading import shared_normals
 
 if TYPE_CHECKING:
+    from .meshes import LoadedModel
     from .scene import Output
 
 # Names of prims below a body.
@@ -52,6 +53,8 @@ class Shape:
     """Thickness of springs or particles, m."""
     kinds: np.ndarray | None = None
     """Kind of each spring, int [point_count / 2], where colours show it; otherwise all colours show forces."""
+    model: LoadedModel | None = None
+    """The model whose polygons these are."""
 
     @property
     def normal_count(self) -> int:
@@ -75,7 +78,7 @@ class ShapeFrame:
     """Magnitude of the total force on each particle, float32 [point_count], N."""
 
 
-def shapes_of(body: str, lattice: Lattice, output: Output, drawing: Drawing | None = None) -> list[Shape]:
+def shapes_of(body: str, lattice: Lattice, output: Output, model: LoadedModel | None = None) -> list[Shape]:
     """Return what the stage shows of a body.
 
     A body without faces is shown by its springs and particles, whatever is asked for.
@@ -84,13 +87,13 @@ def shapes_of(body: str, lattice: Lattice, output: Output, drawing: Drawing | No
         body: its name.
         lattice: what it is made of.
         output: what to show.
-        drawing: the model that it was made from, where there is one.
+        model: the model that it was made from, in the frame of the body, where it is to be seen.
     """
     faces = len(lattice.surface_quads) > 0
     shown = output.show if faces else [SPRINGS, PARTICLES]
     shapes = []
     if SURFACE in shown:
-        shapes.append(_surface(body, lattice, output.surface, drawing))
+        shapes.append(_surface(body, lattice, output.surface, model))
     if SPRINGS in shown and lattice.spring_count:
         shapes.append(_springs(body, lattice, by_kind=output.spring_colors == "kind"))
     if PARTICLES in shown:
@@ -104,14 +107,15 @@ def _alone(particles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return particles[:, None], np.ones((len(particles), 1), np.float32)
 
 
-def _surface(body: str, lattice: Lattice, surface: str, drawing: Drawing | None) -> Shape:
+def _surface(body: str, lattice: Lattice, surface: str, model: LoadedModel | None) -> Shape:
     if lattice.grid is None:
         hung = _alone(lattice.surface_particles)
         return Shape(body, SURFACE, *hung, *_as_polygons(lattice.surface_quads), double_sided=True)
-    if surface == "model" and drawing is not None:
-        hung = embed(lattice, drawing.vertices, containing_cells(lattice, drawing.vertices))
-        polygons = drawing.counts.astype(np.int32), drawing.corners.astype(np.int32)
-        return Shape(body, SURFACE, *hung, *polygons, corner_normals=drawing.shading())
+    if model is not None:
+        part = model.drawing
+        hung = embed(lattice, part.vertices, containing_cells(lattice, part.vertices))
+        polygons = part.counts.astype(np.int32), part.corners.astype(np.int32)
+        return Shape(body, SURFACE, *hung, *polygons, corner_normals=shared_normals(part), model=model)
     if surface == "smooth":
         quads = lattice.surface_quads
         points = _smoothed(lattice.particles[lattice.surface_particles], quads)

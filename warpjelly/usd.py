@@ -11,17 +11,25 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, Vt
+
+from warpjelly.kernels.lattices import BEND, FACE_SHEAR, STRUCTURAL
 
 from .colors import COLOR_MAP, KIND_COLORS, LINEAR_TABLE, color_indices
 from .errors import EnvironmentFailedError, InputError, reason
 from .files import whole_file
 from .scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider, plane_frame
 from .shapes import SPRINGS, SURFACE, Shape, ShapeFrame
+from .usdlooks import define_look
+
+if TYPE_CHECKING:
+    from .meshes import LoadedModel
 
 STAGE_NAME = "stage.usdc"
+TEXTURES_NAME = "textures"
 
 _WORLD = Sdf.Path("/World")
 _BODIES = _WORLD.AppendChild("bodies")
@@ -38,6 +46,7 @@ _CAMERA_DIRECTION = (0.6, 0.45, 1.0)
 _FRAME_FILL = 0.92
 _KEY_DIRECTION = (-0.6, 1.2, 0.5)
 _FILL_DIRECTION = (1.0, 0.4, 0.3)
+_KIND_NAMES = {"structural": STRUCTURAL, "shear": FACE_SHEAR, "bend": BEND}
 # Linear grey of everything that is not jelly.
 _COLLIDER_GREY = 0.4
 # Edge of the square that stands for an infinite wall, in diagonals of the motion.
@@ -58,7 +67,7 @@ class StageWriter:
         rest: Sequence[ShapeFrame],
         provenance: Mapping[str, object],
     ) -> None:
-        """Prepare a stage; no file is made before ``close``.
+        """Prepare a stage; but for textures, no file is made before ``close``.
 
         Args:
             path: the stage file to make, ``.usdc``; its folder is made if missing.
@@ -89,7 +98,9 @@ class StageWriter:
         _define_looks(stage)
         _define_lights(stage, scene)
         for shape, sample in zip(shapes, rest, strict=True):
-            _define_shape(stage, shape, sample, scene)
+            prim = _define_shape(stage, shape, sample, scene)
+            if shape.model is not None:
+                _define_model(prim, shape.body, shape.model, scene, path.parent / TEXTURES_NAME)
 
     def write_frame(self, index: int, samples: Sequence[ShapeFrame]) -> None:
         """Add one sample.
@@ -130,6 +141,8 @@ class StageWriter:
         stage.SetStartTimeCode(0)
         stage.SetEndTimeCode(max(self._frame_count - 1, 0))
         legend = {"quantity": "force", "unit": "N", "range": Gf.Vec2d(*force_range), "colorMap": COLOR_MAP}
+        if any(shape.kinds is not None for shape in self._shapes):
+            legend["springs"] = {name: Gf.Vec3d(*KIND_COLORS[kind].tolist()) for name, kind in _KIND_NAMES.items()}
         stage.GetDefaultPrim().SetCustomDataByKey("legend", legend)
         _define_colliders(stage, self._scene, self._bounds, self._rest_center)
         _define_camera(stage, self._scene, self._bounds)
@@ -264,7 +277,7 @@ def _define_lights(stage: Usd.Stage, scene: Scene) -> None:
         light.MakeMatrixXform().Set(_matrix(_facing(direction, scene), np.zeros(3)))
 
 
-def _define_shape(stage: Usd.Stage, shape: Shape, rest: ShapeFrame, scene: Scene) -> None:
+def _define_shape(stage: Usd.Stage, shape: Shape, rest: ShapeFrame, scene: Scene) -> UsdGeom.PointBased:
     path = _shape_path(shape)
     Usd.ModelAPI(UsdGeom.Xform.Define(stage, path.GetParentPath())).SetKind(Kind.Tokens.component)
     prim: UsdGeom.PointBased
@@ -283,6 +296,26 @@ def _define_shape(stage: Usd.Stage, shape: Shape, rest: ShapeFrame, scene: Scene
         _set_colors(prim, UsdGeom.Tokens.uniform, KIND_COLORS, shape.kinds, scene)
     else:
         _set_colors(prim, UsdGeom.Tokens.vertex, LINEAR_TABLE, np.zeros(len(rest.points), np.int32), scene)
+    return prim
+
+
+def _define_model(mesh: UsdGeom.Mesh, body: str, model: LoadedModel, scene: Scene, texture_folder: Path) -> None:
+    """Give a mesh the UVs and the materials of the model whose polygons it has."""
+    part = model.drawing
+    if part.uvs is not None:
+        uvs = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+            "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.faceVarying
+        )
+        uvs.Set(Vt.Vec2fArray.FromNumpy(np.ascontiguousarray(part.uvs, np.float32)))
+    if scene.output.look == "force":
+        return
+    for number in np.unique(part.looks[part.looks >= 0]).tolist():
+        look, faces = model.looks[number], np.flatnonzero(part.looks == number)
+        # Names of different bodies and of one file may be alike, and need not be such that USD allows.
+        name = Tf.MakeValidIdentifier(f"{body}_{number}_{look.name}")
+        material = define_look(mesh.GetPrim().GetStage(), _LOOKS.AppendChild(name), look, texture_folder)
+        subset = UsdShade.MaterialBindingAPI(mesh).CreateMaterialBindSubset(name, _integers(faces))
+        UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(material)
 
 
 def _set_colors(prim: UsdGeom.Gprim, interpolation: str, table: np.ndarray, indices: np.ndarray, scene: Scene) -> None:
