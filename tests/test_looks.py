@@ -102,6 +102,7 @@ def test_obj_keeps_what_it_is_drawn_with(tmp_path: Path, caplog: pytest.LogCaptu
             {"diffuseColor": sky, "roughness": 0.25, "metallic": 1.0, "opacity": sky.of("a"), "normal": bumps},
         ),
     ]
+    assert len(model.looks) == 2
     assert not caplog.records
 
 
@@ -158,10 +159,10 @@ def test_what_is_missing_of_materials_is_a_warning(
 
 def test_corners_without_uvs_and_normals(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Fill gaps with UVs of 0 and normals of the polygon, and warn of numbers that are out of range."""
-    triangle = "v 0 0 0\nv 0 2 0\nv 0 0 3\nvt 0.5 0.5\nvn 1 0 0\n"
+    triangle = "v 0 0 0\nv 0 2 0\nv 0 0 3\nvt 0.5\nvn 1 0 0\n"
     (tmp_path / "a.obj").write_text(triangle + "f 1/1/1 3/1 2//9\nf 1/7 2/7 3/-2")
     drawing = load_model(tmp_path / "a.obj").drawing
-    np.testing.assert_array_equal(drawing.uvs, [[0.5, 0.5], [0.5, 0.5], [0, 0], [0, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(drawing.uvs, [[0.5, 0], [0.5, 0], *[[0, 0]] * 4])
     np.testing.assert_array_equal(drawing.normals, [[1, 0, 0], *[[-1, 0, 0]] * 2, *[[1, 0, 0]] * 3])
     assert "3 corners have texture coordinates that do not exist" in caplog.text
     assert "1 corners have normals that do not exist" in caplog.text

@@ -25,7 +25,7 @@ from .polygons import Model, Part, from_polygons, placed
 log = logging.getLogger("warpjelly")
 
 # Extensions without which the coordinates of a mesh are missing.
-_COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
+_COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
 _WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
@@ -271,7 +271,7 @@ def _image(file: _File, image: dict[str, Any], number: int) -> tuple[str, bytes]
         view = file.all("bufferViews")[image["bufferView"]]
         start = view.get("byteOffset", 0)
         return name + suffix, file.buffers[view["buffer"]][start : start + view["byteLength"]]
-    uri = image["uri"]
+    uri = image.get("uri", "")
     if uri.startswith("data:"):
         suffix = _SUFFIXES.get(uri[5:].split(";")[0].split(",")[0], "")
         return name + suffix, _content(file.path, uri)
