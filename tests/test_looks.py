@@ -137,7 +137,7 @@ def test_names_are_said_to_be_missing(tmp_path: Path) -> None:
     [
         ({}, "the materials of paint.mtl cannot be read: No such file or directory"),
         ({"paint.mtl": "newmtl blue\nmap_Kd -bm 1 none.png"}, "the texture none.png cannot be read: No such file"),
-        ({"paint.mtl": "newmtl blue\nmap_Kd"}, "paint.mtl: the texture  cannot be read: Is a directory"),
+        ({"paint.mtl": "newmtl blue\nmap_Kd"}, "paint.mtl: the texture . cannot be read: Is a directory"),
         ({"paint.mtl": f"newmtl blue\nmap_Kd {'a' * 300}.png"}, "cannot be read: File name too long"),
         ({"paint.mtl": "newmtl blue\nKd red"}, "paint.mtl: material blue: cannot read 'kd red'"),
         ({"paint.mtl": "newmtl blue\nd"}, "paint.mtl: material blue: cannot read 'd'"),
@@ -629,6 +629,41 @@ def test_usd_inputs_are_found_through_the_material(tmp_path: Path) -> None:
     stage.Export(str(tmp_path / "a.usda"))
     expected = Look("m", {"diffuseColor": replace(SKY, name="red.png", data=RED), "roughness": 0.75})
     assert load_model(tmp_path / "a.usda").looks == [expected]
+
+
+def test_usd_inputs_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Take colours of double precision, and warn of a text for a number and of a colour that a shader computes."""
+    stage, mesh = new_stage()
+    material = define_look(stage, Sdf.Path("/World/m"), Look("m", {"metallic": 0.5}), tmp_path / "textures")
+    surface = UsdShade.Shader.Get(stage, "/World/m/surface")
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3d).Set(Gf.Vec3d(0.1, 0.2, 0.3))
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Token).Set("rough")
+    reader = UsdShade.Shader.Define(stage, "/World/m/reader")
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    glow = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
+    surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(glow)
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    stage.Export(str(tmp_path / "a.usda"))
+    assert load_model(tmp_path / "a.usda").looks == [Look("m", {"metallic": 0.5, "diffuseColor": (0.1, 0.2, 0.3)})]
+    assert "/World/m/surface.inputs:roughness is of another type; left out" in caplog.text
+    assert "/World/m/reader is left out, because it is not a UsdUVTexture" in caplog.text
+
+
+def test_instances_share_looks(tmp_path: Path) -> None:
+    """Read the looks of a file that is instanced twice once."""
+    write_looks(tmp_path)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "b.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    for k in range(2):
+        copy = UsdGeom.Xform.Define(stage, f"/World/copy{k}")
+        copy.GetPrim().GetReferences().AddReference("./a.usda")
+        copy.GetPrim().SetInstanceable(True)
+    stage.Save()
+    model = load_model(tmp_path / "b.usda")
+    assert model.looks == LOOKS
+    np.testing.assert_array_equal(model.drawing.looks, [0, 1, 0, 1])
+    assert len(model.region("/World/copy1")) == len(model.region("World")) / 2 == 3
+    assert len(model.region("/World/copy1/looks/plain")) == 2
 
 
 def test_groups_of_overlapping_subsets_have_all_names(tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ import base64
 import json
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from urllib.parse import unquote
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
-from .looks import Look, Placing, Texture, Value, image_file
+from .looks import Images, Look, Placing, Texture, Value
 from .polygons import Model, Part, from_polygons, placed
 
 log = logging.getLogger("warpjelly")
@@ -42,6 +42,8 @@ class _File:
     """Its JSON."""
     buffers: list[bytes]
     """What its arrays are in."""
+    images: Sequence[tuple[str, bytes] | None] = ()
+    """Name and content of its images; None where one cannot be read."""
 
     def all(self, kind: str) -> list[dict[str, Any]]:
         """Return all buffers, nodes, meshes, ... of the file."""
@@ -66,6 +68,7 @@ def read_gltf(path: Path) -> Model:
         raise ValueError(f"its meshes are compressed with {min(needed)}; save it without")
     uris = [buffer.get("uri") for buffer in header.get("buffers", [])]
     file = _File(path, header, [body if uri is None else _content(path, uri) for uri in uris])
+    file = replace(file, images=[_image(file, image, number) for number, image in enumerate(file.all("images"))])
     parts = [
         placed(part, matrix)
         for mesh, matrix, names in _placements(file)
@@ -242,14 +245,14 @@ def _texture(file: _File, material: str, kind: str, use: dict[str, Any], uv_set:
         return None
     texture = file.all("textures")[use["index"]]
     source = texture.get("source", -1)
-    found = _image(file, file.all("images")[source], source) if source >= 0 else None
+    found = file.images[source] if source >= 0 else None
     if found is None:
         log.warning("%s: material %s has no %s", file.path, material, kind)
         return None
     sampler = file.all("samplers")[texture["sampler"]] if "sampler" in texture else {}
     along_u, along_v = (_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT"))
     placing = _placing(use.get("extensions", {}).get("KHR_texture_transform", {}))
-    return Texture(*found, srgb=kind in _SRGB, wrap=(along_u, along_v), placing=placing)
+    return Texture(found[0], found[1], srgb=kind in _SRGB, wrap=(along_u, along_v), placing=placing)
 
 
 def _placing(transform: dict[str, Any]) -> Placing:
@@ -275,4 +278,4 @@ def _image(file: _File, image: dict[str, Any], number: int) -> tuple[str, bytes]
     if uri.startswith("data:"):
         suffix = _SUFFIXES.get(uri[5:].split(";")[0].split(",")[0], "")
         return name + suffix, _content(file.path, uri)
-    return image_file(file.path, unquote(uri))
+    return Images(file.path).read(unquote(uri))
