@@ -292,7 +292,7 @@ def test_gltf_keeps_what_it_is_drawn_with(tmp_path: Path, name: str, caplog: pyt
         ],
         nodes=[{"name": "top", "children": [1]}, {"name": "side", "mesh": 0, "scale": [-1, 1, 1]}],
         images=[
-            {"bufferView": 5, "mimeType": "image/png", "name": "red"},
+            {"bufferView": 5, "mimeType": "image/png", "name": "red.png"},
             {"uri": "blue%20sky.jpg"},
             {"uri": text},
         ],
@@ -486,7 +486,7 @@ LOOKS = [
             "emissiveColor": replace(SKY, placing=Placing(90.0, (2, 0.5), (0.25, 1))),
             "roughness": Texture("red.png", RED, "g", bias=(0, 0.5, 0, 0)),
             "metallic": Texture("red.png", RED, "b", bias=(0, 0.5, 0, 0)),
-            "occlusion": Texture("red.png", RED, "r"),
+            "occlusion": Texture("red.png", RED, "r", wrap=("useMetadata", "black")),
             "normal": Texture("sky.png", BLUE, scale=(2, 2, 2, 1), bias=(-1, -1, -1, 0)),
         },
     ),

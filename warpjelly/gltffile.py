@@ -28,7 +28,7 @@ log = logging.getLogger("warpjelly")
 _COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
+_WRAPS = {33071: "clamp", 33648: "mirror"}
 _SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg"}
 _SRGB = {"baseColorTexture", "emissiveTexture"}
 
@@ -178,18 +178,20 @@ def _elements(file: _File, place: dict[str, Any], count: int, width: int, kind: 
     return np.ndarray((count, width), dtype, file.buffers[view["buffer"]], start, (stride, dtype.itemsize))
 
 
+def _maps(material: dict[str, Any]) -> dict[str, Any]:
+    """Return all that a material has, in one table."""
+    return {**material.get("pbrMetallicRoughness", {}), **material}
+
+
 def _uv_set(file: _File, material: int) -> int:
-    """Return which of the sets of UVs the textures of a material use: that of its first one."""
-    if material < 0:
-        return 0
-    found = file.all("materials")[material]
-    maps = {**found.get("pbrMetallicRoughness", {}), **found}
-    return next((use.get("texCoord", 0) for name, use in maps.items() if name.endswith("Texture")), 0)
+    """Return which of the sets of UVs a material uses: that of its color, or else of its first texture."""
+    maps = _maps(file.all("materials")[material]) if material >= 0 else {}
+    uses = [maps[kind] for kind in ("baseColorTexture", *maps) if kind in maps and kind.endswith("Texture")]
+    return uses[0].get("texCoord", 0) if uses else 0
 
 
 def _look(file: _File, material: dict[str, Any], number: int) -> Look:
-    name = material.get("name", f"material_{number}")
-    maps = {**material.get("pbrMetallicRoughness", {}), **material}
+    name, maps = material.get("name", f"material_{number}"), _maps(material)
     textures = {
         kind: texture
         for kind, use in maps.items()
@@ -250,7 +252,7 @@ def _texture(file: _File, material: str, kind: str, use: dict[str, Any], uv_set:
         log.warning("%s: material %s has no %s", file.path, material, kind)
         return None
     sampler = file.all("samplers")[texture["sampler"]] if "sampler" in texture else {}
-    along_u, along_v = (_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT"))
+    along_u, along_v = (_WRAPS.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT"))
     placing = _placing(use.get("extensions", {}).get("KHR_texture_transform", {}))
     return Texture(found[0], found[1], srgb=kind in _SRGB, wrap=(along_u, along_v), placing=placing)
 
@@ -273,9 +275,9 @@ def _image(file: _File, image: dict[str, Any], number: int) -> tuple[str, bytes]
     if "bufferView" in image:
         view = file.all("bufferViews")[image["bufferView"]]
         start = view.get("byteOffset", 0)
-        return name + suffix, file.buffers[view["buffer"]][start : start + view["byteLength"]]
+        return name.removesuffix(suffix) + suffix, file.buffers[view["buffer"]][start : start + view["byteLength"]]
     uri = image.get("uri", "")
     if uri.startswith("data:"):
         suffix = _SUFFIXES.get(uri[5:].split(";")[0].split(",")[0], "")
-        return name + suffix, _content(file.path, uri)
+        return name.removesuffix(suffix) + suffix, _content(file.path, uri)
     return Images(file.path).read(unquote(uri))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -27,14 +27,14 @@ class Texture:
 
     name: str
     """Name of a file for it."""
-    data: bytes
+    data: bytes = field(repr=False)
     """Content of that file: PNG, JPEG or what else a viewer reads."""
     channel: str = "rgb"
     """What of the image is taken: rgb, r, g, b or a."""
     srgb: bool = False
     """Whether its colours are in sRGB; otherwise its values are taken as they are."""
     wrap: tuple[str, str] = ("repeat", "repeat")
-    """What is beyond the image along u and v: repeat, clamp, mirror or black."""
+    """What is beyond the image along u and v: repeat, clamp, mirror, black or, as the image says, useMetadata."""
     scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     """Factors of red, green, blue and alpha."""
     bias: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)

@@ -31,7 +31,6 @@ _TYPES = {
     "normal": Sdf.ValueTypeNames.Normal3f,
     "useSpecularWorkflow": Sdf.ValueTypeNames.Int,
 }
-_WRAPS = {"repeat", "clamp", "mirror", "black"}
 
 
 def read_look(file: Path, material: UsdShade.Material, images: dict[str, bytes]) -> Look | None:
@@ -84,14 +83,13 @@ def _texture(file: Path, output: Usd.Attribute, name: str, images: dict[str, byt
         log.warning("%s: %s: the texture %s is missing", file, shader.GetPath(), asset.path)
         return None
     space = _input(shader, "sourceColorSpace", "auto")
-    wraps = (_input(shader, key, "repeat") for key in ("wrapS", "wrapT"))
-    along_u, along_v = (wrap if wrap in _WRAPS else "repeat" for wrap in wraps)
+    wrap = (_input(shader, "wrapS", "useMetadata"), _input(shader, "wrapT", "useMetadata"))
     return Texture(
         re.split(r"[/\\\[\]]", asset.path.rstrip("]"))[-1],
         images[path],
         UsdShade.Output(output).GetBaseName(),
         space == "sRGB" or (space == "auto" and name in _COLORS),
-        (along_u, along_v),
+        wrap,
         tuple(_input(shader, "scale", (1.0, 1.0, 1.0, 1.0))),
         tuple(_input(shader, "bias", (0.0, 0.0, 0.0, 0.0))),
         _placing(shader),
@@ -104,10 +102,8 @@ def _placing(texture: UsdShade.Shader) -> Placing:
     shader = UsdShade.Shader(source.GetPrim()) if source else None
     if not shader or shader.GetShaderId() != "UsdTransform2d":
         return Placing()
-    along_u, along_v = _input(shader, "scale", (1.0, 1.0))
-    return Placing(
-        _input(shader, "rotation", 0.0), (along_u, along_v), tuple(_input(shader, "translation", (0.0, 0.0)))
-    )
+    scale, translation = _input(shader, "scale", (1.0, 1.0)), _input(shader, "translation", (0.0, 0.0))
+    return Placing(_input(shader, "rotation", 0.0), (scale[0], scale[1]), (translation[0], translation[1]))
 
 
 def _source(shader: UsdShade.Shader, name: str) -> Usd.Attribute | None:
