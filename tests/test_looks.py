@@ -102,6 +102,7 @@ def test_obj_keeps_what_it_is_drawn_with(tmp_path: Path, caplog: pytest.LogCaptu
             {"diffuseColor": sky, "roughness": 0.25, "metallic": 1.0, "opacity": sky.of("a"), "normal": bumps},
         ),
     ]
+    assert len(model.looks) == 2
     assert not caplog.records
 
 
@@ -136,7 +137,7 @@ def test_names_are_said_to_be_missing(tmp_path: Path) -> None:
     [
         ({}, "the materials of paint.mtl cannot be read: No such file or directory"),
         ({"paint.mtl": "newmtl blue\nmap_Kd -bm 1 none.png"}, "the texture none.png cannot be read: No such file"),
-        ({"paint.mtl": "newmtl blue\nmap_Kd"}, "paint.mtl: the texture  cannot be read: Is a directory"),
+        ({"paint.mtl": "newmtl blue\nmap_Kd"}, "paint.mtl: the texture . cannot be read: Is a directory"),
         ({"paint.mtl": f"newmtl blue\nmap_Kd {'a' * 300}.png"}, "cannot be read: File name too long"),
         ({"paint.mtl": "newmtl blue\nKd red"}, "paint.mtl: material blue: cannot read 'kd red'"),
         ({"paint.mtl": "newmtl blue\nd"}, "paint.mtl: material blue: cannot read 'd'"),
@@ -158,10 +159,10 @@ def test_what_is_missing_of_materials_is_a_warning(
 
 def test_corners_without_uvs_and_normals(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     """Fill gaps with UVs of 0 and normals of the polygon, and warn of numbers that are out of range."""
-    triangle = "v 0 0 0\nv 0 2 0\nv 0 0 3\nvt 0.5 0.5\nvn 1 0 0\n"
+    triangle = "v 0 0 0\nv 0 2 0\nv 0 0 3\nvt 0.5\nvn 1 0 0\n"
     (tmp_path / "a.obj").write_text(triangle + "f 1/1/1 3/1 2//9\nf 1/7 2/7 3/-2")
     drawing = load_model(tmp_path / "a.obj").drawing
-    np.testing.assert_array_equal(drawing.uvs, [[0.5, 0.5], [0.5, 0.5], [0, 0], [0, 0], [0, 0], [0, 0]])
+    np.testing.assert_array_equal(drawing.uvs, [[0.5, 0], [0.5, 0], *[[0, 0]] * 4])
     np.testing.assert_array_equal(drawing.normals, [[1, 0, 0], *[[-1, 0, 0]] * 2, *[[1, 0, 0]] * 3])
     assert "3 corners have texture coordinates that do not exist" in caplog.text
     assert "1 corners have normals that do not exist" in caplog.text
@@ -291,7 +292,7 @@ def test_gltf_keeps_what_it_is_drawn_with(tmp_path: Path, name: str, caplog: pyt
         ],
         nodes=[{"name": "top", "children": [1]}, {"name": "side", "mesh": 0, "scale": [-1, 1, 1]}],
         images=[
-            {"bufferView": 5, "mimeType": "image/png", "name": "red"},
+            {"bufferView": 5, "mimeType": "image/png", "name": "red.png"},
             {"uri": "blue%20sky.jpg"},
             {"uri": text},
         ],
@@ -485,7 +486,7 @@ LOOKS = [
             "emissiveColor": replace(SKY, placing=Placing(90.0, (2, 0.5), (0.25, 1))),
             "roughness": Texture("red.png", RED, "g", bias=(0, 0.5, 0, 0)),
             "metallic": Texture("red.png", RED, "b", bias=(0, 0.5, 0, 0)),
-            "occlusion": Texture("red.png", RED, "r"),
+            "occlusion": Texture("red.png", RED, "r", wrap=("useMetadata", "black")),
             "normal": Texture("sky.png", BLUE, scale=(2, 2, 2, 1), bias=(-1, -1, -1, 0)),
         },
     ),
@@ -628,6 +629,41 @@ def test_usd_inputs_are_found_through_the_material(tmp_path: Path) -> None:
     stage.Export(str(tmp_path / "a.usda"))
     expected = Look("m", {"diffuseColor": replace(SKY, name="red.png", data=RED), "roughness": 0.75})
     assert load_model(tmp_path / "a.usda").looks == [expected]
+
+
+def test_usd_inputs_of_another_type_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Take colours of double precision, and warn of a text for a number and of a colour that a shader computes."""
+    stage, mesh = new_stage()
+    material = define_look(stage, Sdf.Path("/World/m"), Look("m", {"metallic": 0.5}), tmp_path / "textures")
+    surface = UsdShade.Shader.Get(stage, "/World/m/surface")
+    surface.CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3d).Set(Gf.Vec3d(0.1, 0.2, 0.3))
+    surface.CreateInput("roughness", Sdf.ValueTypeNames.Token).Set("rough")
+    reader = UsdShade.Shader.Define(stage, "/World/m/reader")
+    reader.CreateIdAttr("UsdPrimvarReader_float3")
+    glow = reader.CreateOutput("result", Sdf.ValueTypeNames.Float3)
+    surface.CreateInput("emissiveColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(glow)
+    UsdShade.MaterialBindingAPI.Apply(mesh.GetPrim()).Bind(material)
+    stage.Export(str(tmp_path / "a.usda"))
+    assert load_model(tmp_path / "a.usda").looks == [Look("m", {"metallic": 0.5, "diffuseColor": (0.1, 0.2, 0.3)})]
+    assert "/World/m/surface.inputs:roughness is of another type; left out" in caplog.text
+    assert "/World/m/reader is left out, because it is not a UsdUVTexture" in caplog.text
+
+
+def test_instances_share_looks(tmp_path: Path) -> None:
+    """Read the looks of a file that is instanced twice once."""
+    write_looks(tmp_path)
+    stage = Usd.Stage.CreateNew(str(tmp_path / "b.usda"))
+    UsdGeom.SetStageMetersPerUnit(stage, 1.0)
+    for k in range(2):
+        copy = UsdGeom.Xform.Define(stage, f"/World/copy{k}")
+        copy.GetPrim().GetReferences().AddReference("./a.usda")
+        copy.GetPrim().SetInstanceable(True)
+    stage.Save()
+    model = load_model(tmp_path / "b.usda")
+    assert model.looks == LOOKS
+    np.testing.assert_array_equal(model.drawing.looks, [0, 1, 0, 1])
+    assert len(model.region("/World/copy1")) == len(model.region("World")) / 2 == 3
+    assert len(model.region("/World/copy1/looks/plain")) == 2
 
 
 def test_groups_of_overlapping_subsets_have_all_names(tmp_path: Path) -> None:

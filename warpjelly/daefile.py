@@ -12,7 +12,7 @@ from collada.material import OPAQUE_MODE, Effect, Map, Material
 from collada.scene import Node, SceneNode
 
 from .errors import SceneError
-from .looks import Look, Texture, Value, image_file, shininess_roughness
+from .looks import Images, Look, Texture, Value, shininess_roughness
 from .polygons import Model, Part, from_polygons, placed
 
 
@@ -27,11 +27,12 @@ def read_dae(path: Path) -> Model:
     if document.scene is None:
         raise SceneError(f"{path}: the mesh has no triangles; the file has no scene")
     looks: dict[str, Look] = {}
+    images = Images(path)
     parts = [
         part
         for geometry, names in _placements(document.scene.nodes, np.eye(4), ())
         for primitive in geometry.original.primitives
-        if (part := _part(path, geometry, primitive, names, looks))
+        if (part := _part(geometry, primitive, names, looks, images))
     ]
     unit = document.assetInfo.unitmeter
     return Model(parts, list(looks.values()), 1.0 if unit is None else unit, document.assetInfo.upaxis[0])
@@ -54,11 +55,11 @@ def _names(item: Node | collada.geometry.Geometry | Material) -> tuple[str, ...]
 
 
 def _part(
-    path: Path,
     geometry: collada.geometry.BoundGeometry,
     primitive: collada.primitive.Primitive,
     names: tuple[str, ...],
     looks: dict[str, Look],
+    images: Images,
 ) -> Part | None:
     """Return the polygons of a primitive, and add its look to the others; None if it has points or lines."""
     if isinstance(primitive, collada.polylist.Polylist):
@@ -73,7 +74,7 @@ def _part(
     if node := geometry.materialnodebysymbol.get(primitive.material):
         material = node.target
         if material.id not in looks:
-            looks[material.id] = Look(material.name or material.id, _inputs(path, material.effect))
+            looks[material.id] = Look(material.name or material.id, _inputs(material.effect, images))
         number = list(looks).index(material.id)
         names = (*names, *_names(material))
     uvs = normals = None
@@ -86,11 +87,11 @@ def _part(
     return placed(part, np.asarray(geometry.matrix, float))
 
 
-def _inputs(path: Path, effect: Effect) -> dict[str, Value]:
+def _inputs(effect: Effect, images: Images) -> dict[str, Value]:
     inputs: dict[str, Value] = {}
     for name, value in (("diffuseColor", effect.diffuse), ("emissiveColor", effect.emission)):
         if isinstance(value, Map):
-            if texture := _texture(path, value):
+            if texture := _texture(images, value):
                 inputs[name] = texture
         elif value is not None:
             inputs[name] = tuple(value[:3])
@@ -98,7 +99,7 @@ def _inputs(path: Path, effect: Effect) -> dict[str, Value]:
         inputs["roughness"] = shininess_roughness(effect.shininess)
     clear, share = effect.transparent, effect.transparency
     if isinstance(clear, Map) and effect.opaque_mode == OPAQUE_MODE.A_ONE:
-        if texture := _texture(path, clear):
+        if texture := _texture(images, clear):
             inputs["opacity"] = texture.of("a")
     elif isinstance(clear, tuple) and isinstance(share, float):
         inputs["opacity"] = (
@@ -107,6 +108,6 @@ def _inputs(path: Path, effect: Effect) -> dict[str, Value]:
     return inputs
 
 
-def _texture(path: Path, use: Map) -> Texture | None:
-    image = image_file(path, unquote(use.sampler.surface.image.path.removeprefix("file://")))
+def _texture(images: Images, use: Map) -> Texture | None:
+    image = images.read(unquote(use.sampler.surface.image.path.removeprefix("file://")))
     return Texture(*image, srgb=True) if image else None

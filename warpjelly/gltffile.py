@@ -10,7 +10,7 @@ import base64
 import json
 import logging
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -19,16 +19,16 @@ from urllib.parse import unquote
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
-from .looks import Look, Placing, Texture, Value, image_file
+from .looks import Images, Look, Placing, Texture, Value
 from .polygons import Model, Part, from_polygons, placed
 
 log = logging.getLogger("warpjelly")
 
 # Extensions without which the coordinates of a mesh are missing.
-_COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression"}
+_COMPRESSIONS = {"KHR_draco_mesh_compression", "EXT_meshopt_compression", "KHR_meshopt_compression"}
 _DTYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
-_WRAPS = {33071: "clamp", 33648: "mirror", 10497: "repeat"}
+_WRAPS = {33071: "clamp", 33648: "mirror"}
 _SUFFIXES = {"image/png": ".png", "image/jpeg": ".jpg"}
 _SRGB = {"baseColorTexture", "emissiveTexture"}
 
@@ -42,6 +42,8 @@ class _File:
     """Its JSON."""
     buffers: list[bytes]
     """What its arrays are in."""
+    images: Sequence[tuple[str, bytes] | None] = ()
+    """Name and content of its images; None where one cannot be read."""
 
     def all(self, kind: str) -> list[dict[str, Any]]:
         """Return all buffers, nodes, meshes, ... of the file."""
@@ -66,6 +68,7 @@ def read_gltf(path: Path) -> Model:
         raise ValueError(f"its meshes are compressed with {min(needed)}; save it without")
     uris = [buffer.get("uri") for buffer in header.get("buffers", [])]
     file = _File(path, header, [body if uri is None else _content(path, uri) for uri in uris])
+    file = replace(file, images=[_image(file, image, number) for number, image in enumerate(file.all("images"))])
     parts = [
         placed(part, matrix)
         for mesh, matrix, names in _placements(file)
@@ -175,18 +178,20 @@ def _elements(file: _File, place: dict[str, Any], count: int, width: int, kind: 
     return np.ndarray((count, width), dtype, file.buffers[view["buffer"]], start, (stride, dtype.itemsize))
 
 
+def _maps(material: dict[str, Any]) -> dict[str, Any]:
+    """Return all that a material has, in one table."""
+    return {**material.get("pbrMetallicRoughness", {}), **material}
+
+
 def _uv_set(file: _File, material: int) -> int:
-    """Return which of the sets of UVs the textures of a material use: that of its first one."""
-    if material < 0:
-        return 0
-    found = file.all("materials")[material]
-    maps = {**found.get("pbrMetallicRoughness", {}), **found}
-    return next((use.get("texCoord", 0) for name, use in maps.items() if name.endswith("Texture")), 0)
+    """Return which of the sets of UVs a material uses: that of its color, or else of its first texture."""
+    maps = _maps(file.all("materials")[material]) if material >= 0 else {}
+    uses = [maps[kind] for kind in ("baseColorTexture", *maps) if kind in maps and kind.endswith("Texture")]
+    return uses[0].get("texCoord", 0) if uses else 0
 
 
 def _look(file: _File, material: dict[str, Any], number: int) -> Look:
-    name = material.get("name", f"material_{number}")
-    maps = {**material.get("pbrMetallicRoughness", {}), **material}
+    name, maps = material.get("name", f"material_{number}"), _maps(material)
     textures = {
         kind: texture
         for kind, use in maps.items()
@@ -242,14 +247,14 @@ def _texture(file: _File, material: str, kind: str, use: dict[str, Any], uv_set:
         return None
     texture = file.all("textures")[use["index"]]
     source = texture.get("source", -1)
-    found = _image(file, file.all("images")[source], source) if source >= 0 else None
+    found = file.images[source] if source >= 0 else None
     if found is None:
         log.warning("%s: material %s has no %s", file.path, material, kind)
         return None
     sampler = file.all("samplers")[texture["sampler"]] if "sampler" in texture else {}
-    along_u, along_v = (_WRAPS[sampler.get(key, 10497)] for key in ("wrapS", "wrapT"))
+    along_u, along_v = (_WRAPS.get(sampler.get(key, 0), "repeat") for key in ("wrapS", "wrapT"))
     placing = _placing(use.get("extensions", {}).get("KHR_texture_transform", {}))
-    return Texture(*found, srgb=kind in _SRGB, wrap=(along_u, along_v), placing=placing)
+    return Texture(found[0], found[1], srgb=kind in _SRGB, wrap=(along_u, along_v), placing=placing)
 
 
 def _placing(transform: dict[str, Any]) -> Placing:
@@ -270,9 +275,9 @@ def _image(file: _File, image: dict[str, Any], number: int) -> tuple[str, bytes]
     if "bufferView" in image:
         view = file.all("bufferViews")[image["bufferView"]]
         start = view.get("byteOffset", 0)
-        return name + suffix, file.buffers[view["buffer"]][start : start + view["byteLength"]]
-    uri = image["uri"]
+        return name.removesuffix(suffix) + suffix, file.buffers[view["buffer"]][start : start + view["byteLength"]]
+    uri = image.get("uri", "")
     if uri.startswith("data:"):
         suffix = _SUFFIXES.get(uri[5:].split(";")[0].split(",")[0], "")
-        return name + suffix, _content(file.path, uri)
-    return image_file(file.path, unquote(uri))
+        return name.removesuffix(suffix) + suffix, _content(file.path, uri)
+    return Images(file.path).read(unquote(uri))

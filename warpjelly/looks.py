@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Self
 
@@ -27,14 +27,14 @@ class Texture:
 
     name: str
     """Name of a file for it."""
-    data: bytes
+    data: bytes = field(repr=False)
     """Content of that file: PNG, JPEG or what else a viewer reads."""
     channel: str = "rgb"
     """What of the image is taken: rgb, r, g, b or a."""
     srgb: bool = False
     """Whether its colours are in sRGB; otherwise its values are taken as they are."""
     wrap: tuple[str, str] = ("repeat", "repeat")
-    """What is beyond the image along u and v: repeat, clamp, mirror or black."""
+    """What is beyond the image along u and v: repeat, clamp, mirror, black or, as the image says, useMetadata."""
     scale: tuple[float, ...] = (1.0, 1.0, 1.0, 1.0)
     """Factors of red, green, blue and alpha."""
     bias: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0)
@@ -68,16 +68,26 @@ def shininess_roughness(exponent: float) -> float:
     return (2.0 / (max(exponent, 0.0) + 2.0)) ** 0.25
 
 
-def image_file(model: Path, name: str) -> tuple[str, bytes] | None:
-    """Read an image file that a model names; beside the model, too, where the path belongs to another machine.
+class Images:
+    """The image files that a model names, each of which is read once."""
 
-    Returns:
-        The name of the file and what is in it; None, after a warning, if it cannot be read.
-    """
-    path = Path(name.replace("\\", "/"))
-    try:
-        beside = model.parent / path
-        return path.name, (beside if beside.exists() else model.parent / path.name).read_bytes()
-    except OSError as error:
-        log.warning("%s: the texture %s cannot be read: %s", model, name, error.strerror)
-        return None
+    def __init__(self, model: Path) -> None:
+        self._model = model
+        self._read: dict[str, tuple[str, bytes] | None] = {}
+
+    def read(self, name: str) -> tuple[str, bytes] | None:
+        """Return the name of a file without its folder and what is in it; None, after a warning, if it has no content.
+
+        It is looked for beside the model, too, where its path belongs to another machine.
+        """
+        if name not in self._read:
+            self._read[name] = self._found(Path(name.replace("\\", "/")))
+        return self._read[name]
+
+    def _found(self, path: Path) -> tuple[str, bytes] | None:
+        folder = self._model.parent
+        try:
+            return path.name, (folder / path if (folder / path).exists() else folder / path.name).read_bytes()
+        except OSError as error:
+            log.warning("%s: the texture %s cannot be read: %s", self._model, path, error.strerror)
+            return None

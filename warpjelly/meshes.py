@@ -57,7 +57,7 @@ class LoadedModel:
     drawing: Part
     """All its polygons as the file has them."""
     looks: list[Look]
-    """What the polygons look like, by their ``looks``."""
+    """What the polygons look like, by the number that each has in the drawing."""
 
     def scaled(self, factor: float) -> LoadedModel:
         """Return the model made larger by a factor, from the origin."""
@@ -120,7 +120,8 @@ def load_model(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> Lo
     except Exception as error:
         why = " ".join(str(error).split()) or type(error).__name__
         raise SceneError(f"{path}: not a sound {path.suffix} file: {why}") from error
-    return _loaded(path, model, up_axis)
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _loaded(path, model, up_axis)
 
 
 def _read(path: Path, kind: str, prim: str | None) -> Model:
@@ -160,9 +161,8 @@ def _loaded(path: Path, model: Model, up_axis: str) -> LoadedModel:
     if not any((part.counts >= 3).any() for part in model.parts):
         raise SceneError(f"{path}: the mesh has no triangles")
     drawing = joined(model.parts)
-    with np.errstate(over="ignore"):
-        vertices = drawing.vertices * model.unit
-        extent = np.ptp(vertices, axis=0).max()
+    vertices = drawing.vertices * model.unit
+    extent = np.ptp(vertices, axis=0).max()
     if not np.isfinite(extent):
         raise SceneError(f"{path}: the mesh has coordinates that are not finite numbers")
     if not extent > 0:
@@ -172,9 +172,13 @@ def _loaded(path: Path, model: Model, up_axis: str) -> LoadedModel:
         turn = np.array(rows, float).T
         vertices = vertices @ turn
         normals = None if normals is None else normals @ turn
-    drawing = replace(drawing, vertices=vertices, normals=normals)
+    used = np.unique(drawing.looks[drawing.looks >= 0])
+    # The last one, which -1 means, stays -1.
+    look_numbers = np.full(len(model.looks) + 1, -1)
+    look_numbers[used] = np.arange(len(used))
+    drawing = replace(drawing, vertices=vertices, normals=normals, looks=look_numbers[drawing.looks])
     triangles, polygons = triangulate(vertices, drawing.counts, drawing.corners)
     # Formats that repeat the vertices of every triangle would never be watertight otherwise. They repeat them exactly.
     vertices, number = np.unique(vertices, axis=0, return_inverse=True)
     mesh = trimesh.Trimesh(vertices, number.reshape(-1)[triangles], process=False)
-    return LoadedModel(path, mesh, polygons, drawing, model.looks)
+    return LoadedModel(path, mesh, polygons, drawing, [model.looks[number] for number in used])

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from .looks import NORMAL_BIAS, NORMAL_SCALE, Look, Placing, Texture, Value, image_file, shininess_roughness
+from .looks import NORMAL_BIAS, NORMAL_SCALE, Images, Look, Placing, Texture, Value, shininess_roughness
 
 log = logging.getLogger("warpjelly")
 
@@ -69,10 +69,11 @@ def read_mtl(model: Path, file: Path) -> list[Look]:
             statements = found.setdefault(" ".join(words[1:]), {})
         elif words:
             statements[words[0].lower()] = words[1:]
-    return [Look(name, _inputs(file, name, statements)) for name, statements in found.items()]
+    images = Images(file)
+    return [Look(name, _inputs(file, name, statements, images)) for name, statements in found.items()]
 
 
-def _inputs(file: Path, name: str, statements: dict[str, list[str]]) -> dict[str, Value]:
+def _inputs(file: Path, name: str, statements: dict[str, list[str]], images: Images) -> dict[str, Value]:
     inputs: dict[str, Value] = {}
     for kind, (target, value) in _VALUES.items():
         if kind not in statements:
@@ -85,11 +86,11 @@ def _inputs(file: Path, name: str, statements: dict[str, list[str]]) -> dict[str
         if kind not in statements:
             continue
         try:
-            options, name = _options(statements[kind])
+            options, image_name = _options(statements[kind])
             placing = Placing(0.0, _pair(options.get("-s", []), 1.0), _pair(options.get("-o", []), 0.0))
         except ValueError:
             continue
-        if image := image_file(file, name):
+        if image := images.read(image_name):
             wrap = ("clamp", "clamp") if options.get("-clamp") == ["on"] else texture.wrap
             inputs[target] = replace(texture, name=image[0], data=image[1], wrap=wrap, placing=placing)
     color, cutout = inputs.get("diffuseColor"), inputs.get("opacity")

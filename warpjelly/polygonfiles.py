@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import zip_longest
 from pathlib import Path
 
@@ -34,6 +34,76 @@ _PLY_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": "
 _Property = tuple[str, str, str | None]
 
 
+@dataclass
+class _Obj:
+    """What is read of an OBJ file so far."""
+
+    tables: dict[str, list[list[float]]] = field(default_factory=lambda: {"v": [], "vt": [], "vn": []})
+    """Vertices, UVs and normals."""
+    indices: list[list[int]] = field(default_factory=list)
+    """Which of each kinds of corners have, or _NONE."""
+    corners: list[int] = field(default_factory=list)
+    """Kind of each corner: most are written alike several times."""
+    counts: list[int] = field(default_factory=list)
+    """Number of corners of each polygon."""
+    groups: list[int] = field(default_factory=list)
+    """Group of each polygon."""
+    group_numbers: dict[tuple[tuple[str, ...], ...], int] = field(default_factory=dict)
+    """Number of each group, by the names of object, groups and material."""
+    state: dict[str, tuple[str, ...]] = field(default_factory=lambda: {"o": (), "g": (), "usemtl": ()})
+    """The names that the next polygons have."""
+    libraries: list[str] = field(default_factory=list)
+    """Names of files of materials."""
+    known_words: dict[str, int] = field(default_factory=dict)
+    """Kinds of corners by what is written."""
+
+    def read(self, words: list[str]) -> None:
+        """Read a line.
+
+        Raises:
+            ValueError: it is wrong.
+        """
+        kind = words[0]
+        if kind in self.tables:
+            values = [float(word) for word in words[1 : 1 + _OBJ_WIDTHS[kind]]]
+            if kind == "vt" and len(values) == 1:
+                values.append(0.0)
+            if len(values) < _OBJ_WIDTHS[kind]:
+                raise ValueError(f"{kind} needs {_OBJ_WIDTHS[kind]} numbers")
+            self.tables[kind].append(values)
+        elif kind == "f":
+            self.counts.append(len(words) - 1)
+            self.corners += [self.corner(word) for word in words[1:]]
+            self.groups.append(self.group_numbers.setdefault(tuple(self.state.values()), len(self.group_numbers)))
+        elif kind == "g":
+            self.state["g"] = tuple(words[1:])
+        elif kind in self.state:
+            self.state[kind] = (" ".join(words[1:]),)
+        elif kind == "mtllib":
+            self.libraries.append(" ".join(words[1:]))
+
+    def corner(self, word: str) -> int:
+        """Return the kind of a corner that is written like 1/2/3."""
+        if word in self.known_words:
+            return self.known_words[word]
+        written = zip_longest(word.split("/")[:3], self.tables.values(), fillvalue="")
+        self.indices.append([_obj_index(index, len(table)) for index, table in written])
+        # What counts back means something else further down.
+        if "-" not in word:
+            self.known_words[word] = len(self.indices) - 1
+        return len(self.indices) - 1
+
+
+def _obj_index(word: str, count: int) -> int:
+    """Return which of so many values is meant, or _NONE; negative numbers count back from the last one."""
+    if not word:
+        return _NONE
+    index = int(word)
+    if index == 0:
+        raise ValueError("vertices are numbered from 1")
+    return index - 1 if index > 0 else count + index
+
+
 def read_obj(path: Path) -> Model:
     """Read the polygons of all objects of an OBJ file, with their groups and materials.
 
@@ -41,62 +111,28 @@ def read_obj(path: Path) -> Model:
         ValueError: a line is wrong; the message has its number.
     """
     text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
-    tables: dict[str, list[list[float]]] = {"v": [], "vt": [], "vn": []}
-    corners: dict[str, list[int]] = {"v": [], "vt": [], "vn": []}
-    counts: list[int] = []
-    libraries: list[str] = []
-    # What the next polygons belong to: names by the statement that gave them; groups by number, and what each one is.
-    state: dict[str, tuple[str, ...]] = {"o": (), "g": (), "usemtl": ()}
-    groups: list[int] = []
-    known: dict[tuple[tuple[str, ...], ...], int] = {}
+    obj = _Obj()
     for number, line in enumerate(text.split("\n"), 1):
-        words = (line.split("#", 1)[0] if "#" in line else line).split()
-        kind = words[0] if words else ""
-        try:
-            if kind in tables:
-                width = _OBJ_WIDTHS[kind]
-                values = [float(word) for word in words[1 : width + 1]]
-                if len(values) < width:
-                    raise ValueError(f"{kind} needs {width} numbers")
-                tables[kind].append(values)
-            elif kind == "f":
-                counts.append(len(words) - 1)
-                groups.append(known.setdefault(tuple(state.values()), len(known)))
-                for word in words[1:]:
-                    for name, index in zip_longest(tables, word.split("/")[:3], fillvalue=""):
-                        corners[name].append(_obj_index(index, len(tables[name])))
-            elif kind == "g":
-                state["g"] = tuple(words[1:])
-            elif kind in state:
-                state[kind] = (" ".join(words[1:]),)
-            elif kind == "mtllib":
-                libraries.append(" ".join(words[1:]))
-        except ValueError as error:
-            raise ValueError(f"line {number}: {error}") from error
-    looks = _obj_looks(path, libraries, {name for *_, names in known for name in names})
-    numbers = {look.name: k for k, look in enumerate(looks)}
-    group_looks = np.array([numbers.get("".join(names), -1) for *_, names in known], np.int64)
+        if words := (line.split("#", 1)[0] if "#" in line else line).split():
+            try:
+                obj.read(words)
+            except ValueError as error:
+                raise ValueError(f"line {number}: {error}") from error
+    looks = _obj_looks(path, obj.libraries, {name for *_, names in obj.group_numbers for name in names})
+    look_numbers = {look.name: k for k, look in enumerate(looks)}
+    group_looks = np.array([look_numbers.get("".join(names), -1) for *_, names in obj.group_numbers], np.int64)
+    points, uvs, normals = np.array(obj.indices, np.int64).reshape(-1, 3)[obj.corners].T
     part = from_polygons(
-        np.array(tables["v"], float).reshape(-1, 3),
-        counts,
-        corners["v"],
-        uvs=_at_corners(path, tables["vt"], corners["vt"], "texture coordinates"),
-        normals=_at_corners(path, tables["vn"], corners["vn"], "normals"),
-        looks=group_looks[groups],
-        groups=groups,
-        names=[sum(names, ()) for names in known],
+        np.array(obj.tables["v"], float).reshape(-1, 3),
+        obj.counts,
+        points,
+        uvs=_at_corners(path, obj.tables["vt"], uvs, "texture coordinates"),
+        normals=_at_corners(path, obj.tables["vn"], normals, "normals"),
+        looks=group_looks[obj.groups],
+        groups=obj.groups,
+        names=[(*object_name, *groups, *material) for object_name, groups, material in obj.group_numbers],
     )
     return Model([part], looks)
-
-
-def _obj_index(word: str, count: int) -> int:
-    """Return which of the values so far is meant, or _NONE; negative numbers count back from the last one."""
-    if not word:
-        return _NONE
-    index = int(word)
-    if index == 0:
-        raise ValueError("vertices are numbered from 1")
-    return index - 1 if index > 0 else count + index
 
 
 def _obj_looks(path: Path, libraries: list[str], names: set[str]) -> list[Look]:
@@ -110,19 +146,19 @@ def _obj_looks(path: Path, libraries: list[str], names: set[str]) -> list[Look]:
     unknown = sorted(names - looks.keys())
     if unknown and looks:
         log.warning("%s: materials that are in none of its files: %s", path, ", ".join(unknown))
-    return [look for name, look in looks.items() if name in names]
+    return list(looks.values())
 
 
-def _at_corners(path: Path, values: list[list[float]], indices: list[int], name: str) -> np.ndarray | None:
+def _at_corners(path: Path, values: list[list[float]], indices: np.ndarray, name: str) -> np.ndarray | None:
     """Return the value at each corner, NaN where there is none; None where there is none at all."""
-    numbers, table = np.array(indices, np.int64), np.array(values, float)
-    sound = (numbers >= 0) & (numbers < len(table))
-    if lost := int(np.count_nonzero(~sound & (numbers != _NONE))):
+    table = np.array(values, float)
+    sound = (indices >= 0) & (indices < len(table))
+    if lost := int(np.count_nonzero(~sound & (indices != _NONE))):
         log.warning("%s: %d corners have %s that do not exist", path, lost, name)
     if not sound.any():
         return None
-    found = np.full((len(numbers), table.shape[1]), np.nan)
-    found[sound] = table[numbers[sound]]
+    found = np.full((len(indices), table.shape[1]), np.nan)
+    found[sound] = table[indices[sound]]
     return found
 
 

@@ -14,63 +14,82 @@ from .looks import Look, Placing, Texture, Value
 log = logging.getLogger("warpjelly")
 
 # Inputs of UsdPreviewSurface that are read and written.
+_COLORS = ("diffuseColor", "emissiveColor", "specularColor")
+_FLOATS = (
+    "roughness",
+    "metallic",
+    "clearcoat",
+    "clearcoatRoughness",
+    "opacity",
+    "opacityThreshold",
+    "ior",
+    "occlusion",
+)
 _TYPES = {
-    **dict.fromkeys(("diffuseColor", "emissiveColor", "specularColor"), Sdf.ValueTypeNames.Color3f),
-    **dict.fromkeys(("roughness", "metallic", "clearcoat", "clearcoatRoughness"), Sdf.ValueTypeNames.Float),
-    **dict.fromkeys(("opacity", "opacityThreshold", "ior", "occlusion"), Sdf.ValueTypeNames.Float),
+    **dict.fromkeys(_COLORS, Sdf.ValueTypeNames.Color3f),
+    **dict.fromkeys(_FLOATS, Sdf.ValueTypeNames.Float),
     "normal": Sdf.ValueTypeNames.Normal3f,
     "useSpecularWorkflow": Sdf.ValueTypeNames.Int,
 }
-_COLORS = {"diffuseColor", "emissiveColor", "specularColor"}
-_WRAPS = {"repeat", "clamp", "mirror", "black"}
 
 
-def read_look(file: Path, material: UsdShade.Material) -> Look | None:
+def read_look(file: Path, material: UsdShade.Material, images: dict[str, bytes]) -> Look | None:
     """Read a material that is a UsdPreviewSurface; None, after a warning, if it is another one.
 
     Args:
         file: the stage, for warnings.
         material: the material.
+        images: what was read of images so far, by path; what is read now is added.
     """
     shader, path = material.ComputeSurfaceSource()[0], material.GetPath()
     if not shader or shader.GetShaderId() != "UsdPreviewSurface":
         log.warning("%s: material %s is left out, because it is not a UsdPreviewSurface", file, path)
         return None
-    values = {name: _look_value(file, shader, name) for name in _TYPES}
+    values = {name: _look_value(file, shader, name, images) for name in _TYPES}
     return Look(path.name, {name: value for name, value in values.items() if value is not None})
 
 
-def _look_value(file: Path, shader: UsdShade.Shader, name: str) -> Value | None:
+def _look_value(file: Path, shader: UsdShade.Shader, name: str, images: dict[str, bytes]) -> Value | None:
     """Return what an input of a surface is; None if it has the default."""
     source = _source(shader, name)
     if not source:
         return None
     if UsdShade.Utils.GetType(source.GetName()) == UsdShade.AttributeType.Output:
-        return _texture(file, source, name)
+        return _texture(file, source, name, images)
     value = _value(source)
-    return tuple(value) if isinstance(value, Gf.Vec3f) else value
+    try:
+        if name == "useSpecularWorkflow":
+            return int(value)
+        if name in _FLOATS:
+            return float(value)
+        red, green, blue = map(float, value)
+        return red, green, blue
+    except (TypeError, ValueError):
+        log.warning("%s: %s is of another type; left out", file, source.GetPath())
+        return None
 
 
-def _texture(file: Path, output: Usd.Attribute, name: str) -> Texture | None:
+def _texture(file: Path, output: Usd.Attribute, name: str, images: dict[str, bytes]) -> Texture | None:
     """Read the texture that gives an input its value; None, after a warning, if there is none to be had."""
     shader = UsdShade.Shader(output.GetPrim())
     if shader.GetShaderId() != "UsdUVTexture":
         log.warning("%s: %s is left out, because it is not a UsdUVTexture", file, shader.GetPath())
         return None
     asset = _input(shader, "file", Sdf.AssetPath())
-    image = Ar.GetResolver().OpenAsset(Ar.ResolvedPath(asset.resolvedPath)) if asset.resolvedPath else None
-    if not image:
+    path = asset.resolvedPath
+    if path and path not in images and (opened := Ar.GetResolver().OpenAsset(Ar.ResolvedPath(path))):
+        images[path] = bytes(opened.GetBuffer())
+    if path not in images:
         log.warning("%s: %s: the texture %s is missing", file, shader.GetPath(), asset.path)
         return None
     space = _input(shader, "sourceColorSpace", "auto")
-    wraps = (_input(shader, key, "repeat") for key in ("wrapS", "wrapT"))
-    along_u, along_v = (wrap if wrap in _WRAPS else "repeat" for wrap in wraps)
+    wrap = (_input(shader, "wrapS", "useMetadata"), _input(shader, "wrapT", "useMetadata"))
     return Texture(
         re.split(r"[/\\\[\]]", asset.path.rstrip("]"))[-1],
-        bytes(image.GetBuffer()),
+        images[path],
         UsdShade.Output(output).GetBaseName(),
         space == "sRGB" or (space == "auto" and name in _COLORS),
-        (along_u, along_v),
+        wrap,
         tuple(_input(shader, "scale", (1.0, 1.0, 1.0, 1.0))),
         tuple(_input(shader, "bias", (0.0, 0.0, 0.0, 0.0))),
         _placing(shader),
@@ -83,10 +102,8 @@ def _placing(texture: UsdShade.Shader) -> Placing:
     shader = UsdShade.Shader(source.GetPrim()) if source else None
     if not shader or shader.GetShaderId() != "UsdTransform2d":
         return Placing()
-    along_u, along_v = _input(shader, "scale", (1.0, 1.0))
-    return Placing(
-        _input(shader, "rotation", 0.0), (along_u, along_v), tuple(_input(shader, "translation", (0.0, 0.0)))
-    )
+    scale, translation = _input(shader, "scale", (1.0, 1.0)), _input(shader, "translation", (0.0, 0.0))
+    return Placing(_input(shader, "rotation", 0.0), (scale[0], scale[1]), (translation[0], translation[1]))
 
 
 def _source(shader: UsdShade.Shader, name: str) -> Usd.Attribute | None:

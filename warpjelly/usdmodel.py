@@ -165,6 +165,7 @@ class _Looks:
         self.found: list[Look] = []
         self._path = path
         self._numbers: dict[Sdf.Path, int] = {}
+        self._images: dict[str, bytes] = {}
 
     def number(self, prim: Usd.Prim) -> tuple[int, tuple[str, ...]]:
         """Return which look a prim has, -1 if none, and the names of its material."""
@@ -173,12 +174,13 @@ class _Looks:
         material = material or bound.ComputeBoundMaterial(UsdShade.Tokens.full)[0]
         if not material:
             return -1, ()
-        path = material.GetPath()
+        found = material.GetPrim()
+        path = (found.GetPrimInPrototype() if found.IsInstanceProxy() else found).GetPath()
         if path not in self._numbers:
-            look = read_look(self._path, material)
+            look = read_look(self._path, material, self._images)
             self._numbers[path] = len(self.found) if look else -1
             self.found += [look] if look else []
-        return self._numbers[path], (str(path), path.name)
+        return self._numbers[path], (str(found.GetPath()), found.GetName())
 
 
 def _part(path: Path, mesh: UsdGeom.Mesh, looks: _Looks) -> Part:
