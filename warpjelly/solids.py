@@ -163,7 +163,7 @@ def _by_corner(mesh: UsdGeom.Mesh, name: str, frame: int) -> np.ndarray | None:
 def _diffuse(prim: Usd.Prim) -> Any:
     """Return the diffuse colour of a prim's material: linear, or a texture; None where it has no look of its own."""
     material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-    look = read_look(Path(prim.GetStage().GetRootLayer().realPath), material) if material else None
+    look = read_look(Path(prim.GetStage().GetRootLayer().realPath), material, {}) if material else None
     # What a UsdPreviewSurface is unless told otherwise.
     return None if look is None else look.inputs.get("diffuseColor", (0.18, 0.18, 0.18))
 
