@@ -16,6 +16,7 @@ from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
 from .network import build_cloth, build_network
 from .scene import MAX_LENGTH, MIN_LENGTH, AnyBody, ClothBody, CubeBody, ModelBody, NetworkBody, Scene
+from .shapes import PARTICLES, SPRINGS, SURFACE
 
 if TYPE_CHECKING:
     from .meshes import LoadedModel
@@ -33,8 +34,10 @@ BYTES_PER_PARTICLE = {"float32": 240, "float64": 280}
 BYTES_PER_SPAN = 64
 # Resolutions to try where a model has no voxel.
 _FINER = [2**k for k in range(2, 9)]
-# Points, normals, colours and forces of a surface point at a frame; all of them are in memory until the stage is whole.
-BYTES_PER_SURFACE_SAMPLE = 36
+# Points, normals, colours and forces of a point at a frame; all of them are in memory until the stage is whole.
+BYTES_PER_SAMPLE = 36
+# Splitting a surface by directions makes patches of the faces of jelly cubes, wider by so many points than by faces.
+_PATCH_MARGIN = 0.6
 # Scan conversion holds one byte per cell three times, counting what follows from them some more.
 BYTES_PER_GRID_CELL = 6
 
@@ -51,8 +54,8 @@ class BodyPlan:
     """No more springs than this."""
     span_estimate: int
     """About as many spans of springs as this."""
-    surface_estimate: int
-    """About as many points on the surface as this."""
+    point_estimate: int
+    """About as many points are shown as this."""
     voxel_count: int = 0
     """Number of jelly cubes."""
     grid_size: int = 0
@@ -91,7 +94,7 @@ class Plan:
             + BYTES_PER_GRID_CELL * max(plan.grid_size for plan in self.bodies)
             + BYTES_PER_PARTICLE[self.scene.solver.precision] * self.particle_count
             + BYTES_PER_SPAN * sum(plan.span_estimate for plan in self.bodies)
-            + BYTES_PER_SURFACE_SAMPLE * self.scene.frame_count * sum(plan.surface_estimate for plan in self.bodies)
+            + BYTES_PER_SAMPLE * self.scene.frame_count * sum(plan.point_estimate for plan in self.bodies)
         )
 
 
@@ -114,7 +117,7 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
     if isinstance(body, NetworkBody):
         build = partial(build_network, body.points, body.springs(), body.rest_lengths)
         springs = sum(map(len, body.springs()))
-        return BodyPlan(body, build, len(body.points), springs, springs, 2 * springs)
+        return BodyPlan(body, build, len(body.points), springs, springs, 2 * springs + len(body.points))
     if isinstance(body, ClothBody):
         particles = body.particles[0] * body.particles[1]
         build = partial(build_cloth, body.size, body.particles)
@@ -138,8 +141,16 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         particles_per_edge=per_edge,
         weighted=scene.materials[body.material].law == "young",
     )
-    counts = count_lattice(cells, particles_per_edge=per_edge)
-    return BodyPlan(body, build, *counts, int(np.count_nonzero(cells)), cells.size, model)
+    particles, springs, spans, faces = count_lattice(cells, particles_per_edge=per_edge)
+    points = {
+        SURFACE: int(faces * (1 + _PATCH_MARGIN / (per_edge - 1)) ** 2)
+        if model is None
+        else len(model.drawing.vertices),
+        SPRINGS: 2 * springs,
+        PARTICLES: particles,
+    }
+    shown = sum(points[name] for name in set(scene.output.show))
+    return BodyPlan(body, build, particles, springs, spans, shown, int(np.count_nonzero(cells)), cells.size, model)
 
 
 @dataclass(frozen=True)
