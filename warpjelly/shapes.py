@@ -20,7 +20,7 @@ SURFACE, SPRINGS, PARTICLES = "surface", "springs", "particles"
 
 # Taubin's smoothing, a step that shrinks and one that swells as much: curvature is evened out, the volume stays
 # (A signal processing approach to fair surface design, 1995).
-_SHRINK, _SWELL, _SMOOTHINGS = 0.5, -0.53, 10
+_SHRINK, _SWELL, _SMOOTHINGS = 0.5, -0.53, 20
 # Thickness of springs and of particles that are drawn, in typical lengths of the body's springs.
 _SPRING_WIDTH, _PARTICLE_WIDTH = 0.06, 0.25
 

@@ -122,7 +122,8 @@ def _mesh_solids(pyvista: Any, mesh: UsdGeom.Mesh, frame: int) -> Iterator[Solid
             if normals is not None and len(normals) == len(points):
                 surface.point_data.active_normals = np.array(normals)
             surface["color"] = _colors(mesh, frame, len(points))
-            yield Solid(surface, shows_force=mesh.GetDisplayColorPrimvar().ValueMightBeTimeVarying())
+            by_point = mesh.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.vertex
+            yield Solid(surface, shows_force=by_point)
             return
     # VTK has normals and texture coordinates for points alone, so every corner becomes one.
     own = np.full(len(counts), len(subsets))
