@@ -22,9 +22,14 @@ BODY_SHEAR = wp.constant(2)
 BEND = wp.constant(3)
 # What the springs of a class have in common, as one number: kind << 8 | cells << 5 | cells of the bend springs over it.
 # At most 4 cells contain a spring, and at most 4 bend springs, each with at most 4 cells, run over a structural one.
+# Above that, material << 10.
 KIND_SHIFT = wp.constant(8)
 CELLS_SHIFT = wp.constant(5)
-LABEL_COUNT = 4 << KIND_SHIFT
+MATERIAL_SHIFT = wp.constant(10)
+# Springs of several materials have a row instead, with such a number for each material that has, above it, how many of
+# the cells around the spring are of this material. Labels from MIXED on are numbers of rows.
+MAX_MATERIALS = wp.constant(8)
+MIXED = wp.constant(MAX_MATERIALS << MATERIAL_SHIFT)
 
 FULL = wp.constant(255)
 NONE = wp.constant(-1)
@@ -44,6 +49,9 @@ class Grid:
     row_high: wp.array2d(dtype=wp.int32)  # [rows_x, rows_y] z after the last
     patterns: wp.array(dtype=wp.uint8)  # [vertex_count] occupied cells around each vertex
     first: wp.array(dtype=wp.int32)  # [vertex_count] its first particle
+    material_count: int
+    materials: wp.array3d(dtype=wp.uint8)  # [nx, ny, nz] material of each jelly cube; empty where there is one
+    mixed: wp.array(dtype=wp.uint8)  # [vertex_count] whether cells around differ in material; empty as well
 
 
 @wp.struct
@@ -52,7 +60,7 @@ class Springs:
 
     start: wp.vec4i  # particles; NONE where there is no spring
     end: wp.vec4i
-    cells: wp.vec4i  # how many cells contain it
+    cells: wp.vec4i  # the cells that contain it, as a pattern of those around the vertex
 
 
 @wp.struct
@@ -64,7 +72,8 @@ class Bends:
     end: vec8i
     near: vec8i  # which of the springs from the vertex it spans first,
     far: vec8i  # and which of those from the next vertex then
-    cells: vec8i  # the fewer of the cells of these two
+    near_cells: vec8i  # the cells of the first, around the vertex,
+    far_cells: vec8i  # and of the second, around the next vertex
 
 
 @wp.func
@@ -77,6 +86,26 @@ def occupied(grid: Grid, x: int, y: int, z: int):
     if inside:
         filled = int(grid.cells[x / n, y / n, z / n])
     return filled
+
+
+@wp.func
+def material(grid: Grid, x: int, y: int, z: int):
+    """Return the material of an occupied unit cell."""
+    number = int(0)
+    if grid.materials.shape[0] > 0:
+        number = int(grid.materials[x / grid.refinement, y / grid.refinement, z / grid.refinement])
+    return number
+
+
+@wp.func
+def count_materials(grid: Grid, x: int, y: int, z: int, pattern: int):
+    """Return how many of the cells around a vertex that a pattern has are of each material."""
+    counts = vec8i()
+    for number in range(8):
+        if (pattern >> number) % 2 == 1:
+            m = material(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2)
+            counts[m] = counts[m] + 1
+    return counts
 
 
 @wp.func
@@ -97,8 +126,11 @@ def corner_particle(grid: Grid, place: int, number: int):
 
 @wp.func
 def is_inner(grid: Grid, place: int):
-    """Say whether a vertex, if there is one at the place, has all 8 cells around it."""
-    return place >= 0 and int(grid.patterns[wp.max(place, 0)]) == FULL
+    """Say whether a vertex, if there is one at the place, has all 8 cells around it, of one material."""
+    inner = place >= 0 and int(grid.patterns[wp.max(place, 0)]) == FULL
+    if inner and grid.mixed.shape[0] > 0:
+        inner = int(grid.mixed[place]) == 0
+    return inner
 
 
 @wp.func
@@ -125,12 +157,12 @@ def springs_from(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int):
                 repeated = bool(False)
                 for earlier in range(found):
                     if springs.start[earlier] == start and springs.end[earlier] == end:
-                        springs.cells[earlier] = springs.cells[earlier] + 1
+                        springs.cells[earlier] = springs.cells[earlier] | (1 << (7 - number))
                         repeated = True
                 if not repeated:
                     springs.start[found] = start
                     springs.end[found] = end
-                    springs.cells[found] = 1
+                    springs.cells[found] = 1 << (7 - number)
                     found += 1
     return springs
 
@@ -160,7 +192,8 @@ def bends_from(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int):
                             bends.end[found] = far.end[b]
                             bends.near[found] = a
                             bends.far[found] = b
-                            bends.cells[found] = wp.min(near.cells[a], far.cells[b])
+                            bends.near_cells[found] = near.cells[a]
+                            bends.far_cells[found] = far.cells[b]
                             found += 1
     bends.count = found
     return bends
@@ -182,6 +215,10 @@ def find_patterns(
             pattern |= occupied(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2) << number
         grid.patterns[start + z] = wp.uint8(pattern)
         grid.first[start + z] = wp.int32(counts[pattern])
+        if grid.mixed.shape[0] > 0:
+            found = count_materials(grid, x, y, z, pattern)
+            most = wp.max(found)
+            grid.mixed[start + z] = wp.where(most < wp.dot(found, vec8i(1)), wp.uint8(1), wp.uint8(0))
 
 
 @wp.kernel
@@ -190,9 +227,9 @@ def place_particles(
     grid: Grid,
     # Out:
     vertices: wp.array(dtype=wp.vec3i),
-    cells: wp.array(dtype=wp.uint8),
+    cells: wp.array2d(dtype=wp.uint8),
 ):
-    """Overwrite the grid coordinates of the particles of a row, and add the cells that share each."""
+    """Overwrite the grid coordinates of the particles of a row, and add the cells of each material that share each."""
     x, y = wp.tid()
     start = grid.row_start[x, y] - grid.row_low[x, y]
     for z in range(grid.row_low[x, y], grid.row_high[x, y]):
@@ -201,22 +238,67 @@ def place_particles(
             if (pattern >> number) % 2 == 1:
                 particle = corner_particle(grid, start + z, number)
                 vertices[particle] = wp.vec3i(x, y, z)
-                cells[particle] = cells[particle] + wp.uint8(1)
+                m = material(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2)
+                cells[m, particle] = cells[m, particle] + wp.uint8(1)
 
 
 @wp.func
-def bend_cells(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int, slot: int):
+def bend_cells(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int, near: int, far: int):
+    """Return the cells that count for a bend spring from a vertex, of each material.
+
+    Those are the fewer of the cells around both structural springs under it, ``near`` and ``far``, as patterns.
+    """
+    return wp.min(
+        count_materials(grid, x, y, z, near),
+        count_materials(grid, x + dx, y + dy, z + dz, far),
+    )
+
+
+@wp.func
+def cells_of_bends(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int, slot: int):
     """Return the sum of the cells of the bend springs over a structural one, given as one of those from a vertex."""
-    total = int(0)
+    total = vec8i()
     after = bends_from(grid, x, y, z, dx, dy, dz)
     for b in range(after.count):
         if after.near[b] == slot:
-            total += after.cells[b]
+            total += bend_cells(grid, x, y, z, dx, dy, dz, after.near_cells[b], after.far_cells[b])
     before = bends_from(grid, x - dx, y - dy, z - dz, dx, dy, dz)
     for b in range(before.count):
         if before.far[b] == slot:
-            total += before.cells[b]
+            total += bend_cells(grid, x - dx, y - dy, z - dz, dx, dy, dz, before.near_cells[b], before.far_cells[b])
     return total
+
+
+@wp.func
+def describe(grid: Grid, kind: int, around: vec8i, cells: vec8i, bends: vec8i):
+    """Return the row of a spring, from its numbers of cells of each material: around it, in it and in its bends."""
+    row = vec8i()
+    for m in range(grid.material_count):
+        if around[m] > 0:
+            row[m] = around[m] << MATERIAL_SHIFT | kind << KIND_SHIFT | cells[m] << CELLS_SHIFT | bends[m]
+    return row
+
+
+@wp.func
+def label_row(grid: Grid, rows: wp.array(dtype=vec8i), row: vec8i, last: vec8i, at: int):
+    """Return the label of a spring with this row, and where the next row goes.
+
+    Of several materials, store the row at ``at`` unless it is the last one again, or rows are only counted.
+    """
+    label = int(0)
+    found = int(0)
+    for m in range(grid.material_count):
+        if row[m] > 0:
+            label = row[m] % (1 << MATERIAL_SHIFT) | m << MATERIAL_SHIFT
+            found += 1
+    if found > 1:
+        if not (row == last):
+            if at < rows.shape[0]:
+                rows[at] = row
+            at += 1
+            last = row
+        label = MIXED + at - 1
+    return label, last, at
 
 
 @wp.func
@@ -251,11 +333,13 @@ def find_spans(
     starts: wp.array(dtype=wp.int32),
     # Out:
     spans: wp.array(dtype=wp.vec4i),
+    rows: wp.array(dtype=vec8i),
     counts: wp.array(dtype=wp.int32),
 ):
-    """Overwrite the spans (i, j, count, label) of a direction, from its start on, and how many there are.
+    """Overwrite the spans (i, j, count, label) of a direction, and the rows of their labels, from their starts on.
 
-    Without room for spans, count them alone. Unless weighted, labels tell kinds apart alone.
+    Overwrite, too, how many there are; starts and counts are those of all spans, then of all rows. Without room, count
+    alone. Unless weighted, labels and rows tell kinds and materials apart alone.
     """
     d = wp.tid()
     dx = directions[d][0]
@@ -270,6 +354,9 @@ def find_spans(
         if kind == STRUCTURAL:
             inner_label |= 8
     at = starts[d]
+    row_start = starts[kinds.shape[0] + d]
+    row_at = int(row_start)
+    last = vec8i()
     span = wp.vec4i(0, 0, 0, 0)
     for x in range(grid.row_low.shape[0]):
         for y in range(grid.row_low.shape[1]):
@@ -284,25 +371,35 @@ def find_spans(
                         is_inner(grid, vertex(grid, x + 2 * dx, y + 2 * dy, z + 2 * dz))
                     )
                 if inner:
-                    span, at = append_spring(spans, span, at, grid.first[here], grid.first[there], inner_label)
+                    label = inner_label | material(grid, x, y, z) << MATERIAL_SHIFT
+                    span, at = append_spring(spans, span, at, grid.first[here], grid.first[there], label)
                 elif kind == BEND:
                     bends = bends_from(grid, x, y, z, dx, dy, dz)
                     for b in range(bends.count):
-                        label = kind << KIND_SHIFT
+                        near = count_materials(grid, x, y, z, bends.near_cells[b])
+                        far = count_materials(grid, x + dx, y + dy, z + dz, bends.far_cells[b])
+                        cells = vec8i()
                         if weighted:
-                            label |= bends.cells[b] << CELLS_SHIFT
+                            cells = wp.min(near, far)
+                        row = describe(grid, kind, near + far, cells, vec8i())
+                        label, last, row_at = label_row(grid, rows, row, last, row_at)
                         span, at = append_spring(spans, span, at, bends.start[b], bends.end[b], label)
                 else:
                     found = springs_from(grid, x, y, z, dx, dy, dz)
                     for s in range(4):
                         if found.start[s] >= 0:
-                            label = kind << KIND_SHIFT
+                            around = count_materials(grid, x, y, z, found.cells[s])
+                            cells = vec8i()
+                            over = vec8i()
                             if weighted:
-                                label |= found.cells[s] << CELLS_SHIFT
+                                cells = around
                                 if kind == STRUCTURAL:
-                                    label |= bend_cells(grid, x, y, z, dx, dy, dz, s)
+                                    over = cells_of_bends(grid, x, y, z, dx, dy, dz, s)
+                            row = describe(grid, kind, around, cells, over)
+                            label, last, row_at = label_row(grid, rows, row, last, row_at)
                             span, at = append_spring(spans, span, at, found.start[s], found.end[s], label)
     counts[d] = store_span(spans, span, at) - starts[d]
+    counts[kinds.shape[0] + d] = row_at - row_start
 
 
 @wp.kernel

@@ -212,7 +212,7 @@ def test_lattices_match_the_reference(precision: str, device: str) -> None:
     rng = np.random.default_rng(5)
     lattice = build_lattice(rng.random((3, 3, 3)) < 0.6, origin=np.zeros(3), cell_size=0.2, particles_per_edge=3)
     x = lattice.particles + rng.normal(scale=0.02, size=lattice.particles.shape)
-    classes = spring_classes(Material.model_validate(make_material(300.0, 0.5)), lattice)
+    classes = spring_classes([Material.model_validate(make_material(300.0, 0.5))], lattice)
     check_kernels(x, rng.normal(size=x.shape), lattice.spans, classes, precision, device)
 
 
@@ -224,8 +224,8 @@ def test_strain_law_is_hooke_with_constants_over_the_rest_length(kind: int) -> N
     rest = 0.2 * [1, 2**0.5, 3**0.5, 2][kind]
     k, d = list(constants.values())[[0, 1, 1, 2][kind]]
     lattice = build_lattice(np.ones((1, 1, 1), bool), origin=np.zeros(3), cell_size=0.2)
-    hooke = spring_classes(Material.model_validate({"law": "hooke", **tables}), lattice)[kind]
-    strain = spring_classes(Material.model_validate({"law": "strain", **tables}), lattice)[kind]
+    hooke = spring_classes([Material.model_validate({"law": "hooke", **tables})], lattice)[kind]
+    strain = spring_classes([Material.model_validate({"law": "strain", **tables})], lattice)[kind]
     # One multiplication, division or root each.
     np.testing.assert_allclose(hooke, [rest, k, d], rtol=4 * EPSILON["float64"])
     np.testing.assert_allclose(strain, [rest, k / rest, d / rest], rtol=4 * EPSILON["float64"])

@@ -24,13 +24,16 @@ from warpjelly.kernels.lattices import (
     CELLS_SHIFT,
     FACE_SHEAR,
     KIND_SHIFT,
-    LABEL_COUNT,
+    MATERIAL_SHIFT,
+    MAX_MATERIALS,
+    MIXED,
     STRUCTURAL,
     Grid,
     find_faces,
     find_patterns,
     find_spans,
     place_particles,
+    vec8i,
 )
 from warpjelly.kernels.springs import MAX_SPAN
 
@@ -55,22 +58,25 @@ CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
 @dataclass(frozen=True)
 class SpringClasses:
-    """What the springs of a body have in common, whatever its material: a row for each distinct combination."""
+    """What the springs of a body have in common, whatever its materials are: a row for each distinct combination."""
 
     kinds: np.ndarray
     """STRUCTURAL, FACE_SHEAR, BODY_SHEAR or BEND, int [class_count]."""
     rest_lengths: np.ndarray
     """float64 [class_count], m."""
+    shares: np.ndarray
+    """Share of each material of the body in the unit cells around the spring, float64 [class_count, material_count]:
+    those that contain it; of a bend spring, those that contain one of the two structural springs under it."""
     cells: np.ndarray | None = None
-    """How many occupied unit cells contain the spring, int [class_count]; of a bend spring, the fewer of those of the
-    two structural springs under it. None where it was not asked for."""
+    """How many unit cells of each material contain the spring, int [class_count, material_count]; of a bend spring, the
+    fewer of those of the two structural springs under it. None where it was not asked for."""
     bends: np.ndarray | None = None
-    """Sum of ``cells`` of the bend springs over a structural spring, int [class_count]."""
+    """Sum of ``cells`` of the bend springs over a structural spring, int [class_count, material_count]."""
 
 
 @dataclass(frozen=True)
 class Lattice:
-    """One body at rest, in its own frame; a network or a cloth has no cells, and 0 where they are counted."""
+    """One body at rest, in its own frame; in a network or a cloth, which have no cells, a particle counts as of one."""
 
     particles: np.ndarray
     """Rest positions, float64 [particle_count, 3], m."""
@@ -79,7 +85,8 @@ class Lattice:
     int32 [span_count, 4]."""
     classes: SpringClasses
     cell_counts: np.ndarray
-    """How many occupied unit cells share each particle, 1 to 8, uint8 [particle_count]."""
+    """How many unit cells of each material share each particle, together 1 to 8, uint8 [material_count,
+    particle_count]."""
     unit: float
     """Edge of a unit cell, m; without cells, the shortest rest length."""
     surface_particles: np.ndarray
@@ -113,7 +120,13 @@ class Lattice:
 
 
 def build_lattice(
-    cells: np.ndarray, *, origin: np.ndarray, cell_size: float, particles_per_edge: int = 2, weighted: bool = False
+    cells: np.ndarray,
+    *,
+    origin: np.ndarray,
+    cell_size: float,
+    particles_per_edge: int = 2,
+    weighted: bool = False,
+    materials: np.ndarray | None = None,
 ) -> Lattice:
     """Join the occupied cells of a grid into one lattice.
 
@@ -122,15 +135,17 @@ def build_lattice(
         origin: lowest corner of the grid, [3], m.
         cell_size: edge of a jelly cube, m.
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
-        weighted: tell springs apart by how many cells contain them, too; otherwise there are four classes, the kinds.
+        weighted: tell springs apart by how many cells contain them, too; otherwise the classes of each material are the
+            four kinds.
+        materials: material of each jelly cube, from 0 and below MAX_MATERIALS, uint8 [nx, ny, nz]; all 0 if None.
 
     Raises:
         SceneError: the grid has more vertices than can be numbered.
     """
     unit = cell_size / (particles_per_edge - 1)
-    grid, particle_count = _number_particles(cells, particles_per_edge - 1)
+    grid, particle_count = _number_particles(cells, particles_per_edge - 1, materials)
     vertices = wp.empty(particle_count, dtype=wp.vec3i, device="cpu")
-    cell_counts = wp.zeros(particle_count, dtype=wp.uint8, device="cpu")
+    cell_counts = wp.zeros((grid.material_count, particle_count), dtype=wp.uint8, device="cpu")
     _launch(place_particles, grid.row_low.shape, [grid], [vertices, cell_counts])
     particles = vertices.numpy().astype(float)
     # In place: at this size each temporary counts.
@@ -232,7 +247,7 @@ def _launch(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any]) 
     wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu")
 
 
-def _number_particles(cells: np.ndarray, refinement: int) -> tuple[Grid, int]:
+def _number_particles(cells: np.ndarray, refinement: int, materials: np.ndarray | None) -> tuple[Grid, int]:
     """Return the grid of the kernels, with its particles in scan order, and how many there are."""
     start_warp()
     labels, counts = corner_labels()
@@ -260,6 +275,11 @@ def _number_particles(cells: np.ndarray, refinement: int) -> tuple[Grid, int]:
     grid.row_low, grid.row_high = array(low, wp.int32), array(low + lengths, wp.int32)
     grid.patterns = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
     grid.first = wp.empty(vertex_count, dtype=wp.int32, device="cpu")
+    grid.material_count = 1
+    if materials is not None:
+        grid.material_count = int(materials[cells].max()) + 1
+        grid.materials = array(materials, wp.uint8)
+        grid.mixed = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
     _launch(find_patterns, lengths.shape, [grid, array(counts, wp.uint8)], [])
     # From how many particles each vertex has to how many there are before it.
     first = grid.first.numpy()
@@ -283,35 +303,51 @@ def _connect(grid: Grid, unit: float, weighted: bool) -> tuple[np.ndarray, Sprin
     """Return the springs as spans, int32 [span_count, 4], and their classes."""
     directions = wp.array(DIRECTIONS, dtype=wp.vec3i, device="cpu")
     kinds = wp.array(KINDS, dtype=wp.int32, device="cpu")
-    spans = order_spans(_collect(find_spans, len(KINDS), [grid, directions, kinds, weighted]))
-    used = np.zeros(LABEL_COUNT, bool)
-    used[np.arange(4) << KIND_SHIFT] = not weighted
-    used[spans[:, 3]] = True
-    spans[:, 3] = (np.cumsum(used, dtype=np.int32) - 1)[spans[:, 3]]
-    label = np.flatnonzero(used)
-    kinds_used = label >> KIND_SHIFT
-    rest_lengths = REST_LENGTHS[kinds_used] * unit
+    spans, mixed = _collect(find_spans, len(KINDS), [grid, directions, kinds, weighted], wp.vec4i, vec8i)
+    spans = order_spans(spans)
+    used = np.zeros(MIXED + len(mixed), bool)
     if not weighted:
-        return spans, SpringClasses(kinds_used, rest_lengths)
-    cells = label >> CELLS_SHIFT & (1 << KIND_SHIFT - CELLS_SHIFT) - 1
-    return spans, SpringClasses(kinds_used, rest_lengths, cells, label & (1 << CELLS_SHIFT) - 1)
+        used[np.add.outer(np.arange(grid.material_count) << MATERIAL_SHIFT, np.arange(4) << KIND_SHIFT)] = True
+    used[spans[:, 3]] = True
+    # Springs of one material have rows, too: one cell of it.
+    pure = np.flatnonzero(used[:MIXED])
+    rows = np.zeros((len(pure), MAX_MATERIALS), np.int32)
+    rows[np.arange(len(pure)), pure >> MATERIAL_SHIFT] = pure % (1 << MATERIAL_SHIFT) | 1 << MATERIAL_SHIFT
+    mixed, number = np.unique(mixed, axis=0, return_inverse=True)
+    class_of_label = np.concatenate([np.cumsum(used[:MIXED]) - 1, len(pure) + number.reshape(-1)])
+    spans[:, 3] = class_of_label[spans[:, 3]]
+    rows = np.concatenate([rows, mixed])[:, : grid.material_count]
+    return spans, _decode_classes(rows, unit, weighted)
+
+
+def _decode_classes(rows: np.ndarray, unit: float, weighted: bool) -> SpringClasses:
+    """Return the classes of which there are rows of kernels/lattices.py, int [class_count, material_count]."""
+    kinds = rows.max(axis=1) >> KIND_SHIFT & (1 << MATERIAL_SHIFT - KIND_SHIFT) - 1
+    around = rows >> MATERIAL_SHIFT
+    shares = around / around.sum(axis=1, keepdims=True)
+    rest_lengths = REST_LENGTHS[kinds] * unit
+    if not weighted:
+        return SpringClasses(kinds, rest_lengths, shares)
+    cells = rows >> CELLS_SHIFT & (1 << KIND_SHIFT - CELLS_SHIFT) - 1
+    return SpringClasses(kinds, rest_lengths, shares, cells, rows & (1 << CELLS_SHIFT) - 1)
 
 
 def _skin(grid: Grid, particle_count: int) -> tuple[np.ndarray, np.ndarray]:
     """Return the surface particles, int32 [point_count], and the outward quads over them, int32 [face_count, 4]."""
-    quads = _collect(find_faces, 6, [grid])
+    (quads,) = _collect(find_faces, 6, [grid], wp.vec4i)
     on_surface = np.zeros(particle_count, bool)
     on_surface[quads] = True
     point = np.cumsum(on_surface, dtype=np.int32) - np.int32(1)
     return np.flatnonzero(on_surface).astype(np.int32), point[quads]
 
 
-def _collect(kernel: wp.Kernel, dim: int, inputs: list[Any]) -> np.ndarray:
-    """Return what the threads of a kernel find one after another, int32 [count, 4]: count first, then write."""
-    starts, counts = (wp.zeros(dim, dtype=wp.int32, device="cpu") for _ in range(2))
-    _launch(kernel, dim, [*inputs, starts], [wp.empty(0, dtype=wp.vec4i, device="cpu"), counts])
-    total = np.cumsum(counts.numpy())
-    starts.assign(total - counts.numpy())
-    found = wp.empty(int(total[-1]), dtype=wp.vec4i, device="cpu")
-    _launch(kernel, dim, [*inputs, starts], [found, counts])
-    return found.numpy()
+def _collect(kernel: wp.Kernel, dim: int, inputs: list[Any], *types: Any) -> list[np.ndarray]:
+    """Return what the threads of a kernel find one after another, an array of each type: count first, then write."""
+    starts, counts = (wp.zeros(len(types) * dim, dtype=wp.int32, device="cpu") for _ in range(2))
+    _launch(kernel, dim, [*inputs, starts], [*(wp.empty(0, dtype=kind, device="cpu") for kind in types), counts])
+    each = counts.numpy().reshape(len(types), dim)
+    total = np.cumsum(each, axis=1)
+    starts.assign((total - each).ravel())
+    found = [wp.empty(int(count), dtype=kind, device="cpu") for count, kind in zip(total[:, -1], types, strict=True)]
+    _launch(kernel, dim, [*inputs, starts], [*found, counts])
+    return [array.numpy() for array in found]

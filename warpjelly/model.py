@@ -138,12 +138,12 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     shape_starts: list[int] = []
     particle_count = spring_count = class_count = 0
     for number, body_plan in enumerate(plan.bodies):
-        body, material = body_plan.body, scene.materials[body_plan.body.material]
+        body, materials = body_plan.body, [scene.materials[name] for name in body_plan.materials]
         lattice = body_plan.build()
         count = len(lattice.particles)
         if scene.soft_contacts:
             lattices.append(lattice)
-        mass = _masses(lattice, material)
+        mass = _masses(lattice, materials)
         pinned = _pinned(lattice, body)
         x, v = place(lattice, mass, body)
         v[pinned] = 0.0
@@ -153,7 +153,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         inverse_masses.append(np.where(pinned, 0.0, 1.0 / mass))
         charges.append(np.full(count, body.charge))
         spans.append(lattice.spans + np.array([particle_count, particle_count, 0, class_count], np.int32))
-        classes.append(spring_classes(material, lattice))
+        classes.append(spring_classes(materials, lattice))
         chunks.append(np.arange(particle_count, particle_count + count, CHUNK_SIZE, dtype=np.int32))
         chunk_bodies.append(np.full(len(chunks[-1]), number, np.int32))
         shapes += shapes_of(str(body.name), lattice, scene.output, body_plan.model)
@@ -240,51 +240,68 @@ def launch_spring_forces(
     )
 
 
-def spring_classes(material: Material, lattice: Lattice) -> np.ndarray:
+def spring_classes(materials: Sequence[Material], lattice: Lattice) -> np.ndarray:
     """Return (rest length [m], stiffness [N/m], damping [N s/m]) of each class of springs, float64 [class_count, 3].
+
+    A spring has the constants of its material, or the sum of what those of the cells around it contribute: with the
+    laws hooke and strain by their shares, which makes the mean, with the law young by their numbers.
+    """
+    constants = np.zeros((2, len(lattice.classes.kinds)))
+    for number, material in enumerate(materials):
+        add = _young if material.law == "young" else _hooke
+        constants += add(material, lattice, number)
+    return np.stack([lattice.classes.rest_lengths, *constants], axis=1)
+
+
+def _hooke(material: Material, lattice: Lattice, number: int) -> np.ndarray:
+    """Return what a material adds to stiffness [N/m] and damping [N s/m] of each class, float64 [2, class_count].
 
     The law "strain", k_s (l/r - 1) with damping d_s / r, is Hooke's with k = k_s / r and d = d_s / r.
     """
     classes = lattice.classes
-    rest = classes.rest_lengths
-    if material.law == "young":
-        return np.stack([rest, *_young(material, lattice)], axis=1)
-    constants = {
+    by_kind = {
         STRUCTURAL: material.structural,
         FACE_SHEAR: material.shear,
         BODY_SHEAR: material.shear,
         BEND: material.bend,
     }
-    scale = 1.0 / rest if material.law == "strain" else np.ones(len(rest))
-    stiffness = scale * [constants[kind].stiffness for kind in classes.kinds]
-    damping = scale * [constants[kind].damping for kind in classes.kinds]
-    return np.stack([rest, stiffness, damping], axis=1)
+    constants = np.array([(by_kind[kind].stiffness, by_kind[kind].damping) for kind in classes.kinds]).reshape(-1, 2)
+    scale = 1.0 / classes.rest_lengths if material.law == "strain" else 1.0
+    return scale * constants.T * classes.shares[:, number]
 
 
-def _young(material: Material, lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
-    """Return stiffness [N/m] and damping [N s/m] of each class of springs of a solid, float64 [class_count] each.
+def _young(material: Material, lattice: Lattice, number: int) -> np.ndarray:
+    """Return what a material adds to stiffness [N/m] and damping [N s/m] of each class, float64 [2, class_count].
 
     A spring on the surface is in fewer cells than one inside, and weaker by as much: then every cell resists strain
     alike, wherever it is. A bend spring adds twice its stiffness to each of the two structural springs under it, which
-    give up as much.
+    give up as much. All of this holds for the cells of each material alone, and so for their sum.
     """
-    kinds, cells, bends = lattice.classes.kinds, lattice.classes.cells, lattice.classes.bends
-    assert cells is not None and bends is not None and material.youngs_modulus is not None
+    classes = lattice.classes
+    assert classes.cells is not None and classes.bends is not None and material.youngs_modulus is not None
     # How many cells contain a spring inside: 4 around an edge, 2 at a face, 1 around a body diagonal.
-    share = cells / np.array([4, 2, 1, 4])[kinds]
-    stiffness = np.array([YOUNG[kind] for kind in range(4)])[kinds] * share
-    edge = kinds == STRUCTURAL
-    stiffness[edge] += YOUNG[BEND] * (4 * share[edge] - 2 * bends[edge] / 4)
+    share = classes.cells[:, number] / np.array([4, 2, 1, 4])[classes.kinds]
+    stiffness = np.array([YOUNG[kind] for kind in range(4)])[classes.kinds] * share
+    edge = classes.kinds == STRUCTURAL
+    stiffness[edge] += YOUNG[BEND] * (4 * share[edge] - 2 * classes.bends[edge, number] / 4)
     stiffness *= material.youngs_modulus * lattice.unit
-    return stiffness, stiffness * (DAMPING_TIME if material.damping_time is None else material.damping_time)
+    time = DAMPING_TIME if material.damping_time is None else material.damping_time
+    return np.stack([stiffness, stiffness * time])
 
 
-def _masses(lattice: Lattice, material: Material) -> np.ndarray:
-    """Return the mass of each particle, float64 [particle_count], kg."""
-    if material.density is not None:
-        return material.density * lattice.unit**3 / 8.0 * lattice.cell_counts
-    mass = DEFAULT_PARTICLE_MASS if material.particle_mass is None else material.particle_mass
-    return np.full(len(lattice.particles), mass)
+def _masses(lattice: Lattice, materials: Sequence[Material]) -> np.ndarray:
+    """Return the mass of each particle, float64 [particle_count], kg.
+
+    Each cell that shares a particle adds an eighth of its mass or, with ``particle_mass``, its part of a mean.
+    """
+    mass = np.zeros(len(lattice.particles))
+    for material, cells in zip(materials, lattice.cell_counts, strict=True):
+        if material.density is not None:
+            mass += material.density * lattice.unit**3 / 8.0 * cells
+        else:
+            given = DEFAULT_PARTICLE_MASS if material.particle_mass is None else material.particle_mass
+            mass += given * (cells / lattice.cell_counts.sum(axis=0))
+    return mass
 
 
 def _center_of_mass(positions: np.ndarray, mass: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -12,10 +12,23 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from warpjelly.kernels.lattices import MAX_MATERIALS
+
 from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
 from .network import build_cloth, build_network
-from .scene import MAX_LENGTH, MIN_LENGTH, AnyBody, ClothBody, CubeBody, ModelBody, NetworkBody, Scene
+from .scene import (
+    MAX_LENGTH,
+    MIN_LENGTH,
+    AnyBody,
+    ClothBody,
+    CubeBody,
+    ModelBody,
+    ModelRegion,
+    NetworkBody,
+    Scene,
+    VoxelsBody,
+)
 from .shapes import PARTICLES, SPRINGS, SURFACE
 
 if TYPE_CHECKING:
@@ -47,6 +60,8 @@ class BodyPlan:
     """One body, ready to be built."""
 
     body: AnyBody
+    materials: list[str]
+    """Names of its materials, in the order of the lattice."""
     build: Callable[[], Lattice]
     """Makes its particles, springs and surface."""
     particle_count: int
@@ -117,12 +132,14 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
     if isinstance(body, NetworkBody):
         build = partial(build_network, body.points, body.springs(), body.rest_lengths)
         springs = sum(map(len, body.springs()))
-        return BodyPlan(body, build, len(body.points), springs, springs, 2 * springs + len(body.points))
+        shown = 2 * springs + len(body.points)
+        return BodyPlan(body, [body.material], build, len(body.points), springs, springs, shown)
     if isinstance(body, ClothBody):
         particles = body.particles[0] * body.particles[1]
         build = partial(build_cloth, body.size, body.particles)
-        return BodyPlan(body, build, particles, 6 * particles, 6 * particles, particles)
+        return BodyPlan(body, [body.material], build, particles, 6 * particles, 6 * particles, particles)
     model = None
+    regions: Iterable[np.ndarray] = ()
     if isinstance(body, CubeBody):
         cells, cell_size = np.ones((1, 1, 1), bool), body.size
         origin = np.full(3, -body.size / 2)
@@ -130,8 +147,11 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         voxelized = voxelize_model(body, up_axis=scene.up_axis)
         cells, origin, cell_size = voxelized.grid.cells, voxelized.grid.origin, voxelized.grid.cell_size
         model = voxelized.model if scene.output.surface == "model" else None
+        regions = voxelized.regions
     else:
         cells, origin, cell_size = body.grid()
+        regions = body.region_cells()
+    names, materials = _assign_materials(body, cells, regions)
     per_edge = body.particles_per_edge
     build = partial(
         build_lattice,
@@ -139,7 +159,8 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         origin=origin,
         cell_size=cell_size,
         particles_per_edge=per_edge,
-        weighted=scene.materials[body.material].law == "young",
+        weighted=any(scene.materials[name].law == "young" for name in names),
+        materials=materials,
     )
     particles, springs, spans, faces = count_lattice(cells, particles_per_edge=per_edge)
     points = {
@@ -150,7 +171,41 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         PARTICLES: particles,
     }
     shown = sum(points[name] for name in set(scene.output.show))
-    return BodyPlan(body, build, particles, springs, spans, shown, int(np.count_nonzero(cells)), cells.size, model)
+    cubes = int(np.count_nonzero(cells))
+    return BodyPlan(body, names, build, particles, springs, spans, shown, cubes, cells.size, model)
+
+
+def _assign_materials(
+    body: CubeBody | VoxelsBody | ModelBody, cells: np.ndarray, regions: Iterable[np.ndarray]
+) -> tuple[list[str], np.ndarray | None]:
+    """Return the names of a body's materials, and which of them each cell has.
+
+    Args:
+        body: names the material of each region, and that of all other cells.
+        cells: occupied cells, bool [nx, ny, nz].
+        regions: cells of each region, bool [nx, ny, nz] each; of several, the last one counts.
+
+    Returns:
+        Only materials that some cell has; their numbers, uint8 [nx, ny, nz], or None where there is one.
+
+    Raises:
+        SceneError: a region has no cell of the body, or there are too many materials.
+    """
+    if isinstance(body, CubeBody) or not body.regions:
+        return [body.material], None
+    names = list(dict.fromkeys([body.material, *(region.material for region in body.regions)]))
+    numbers = np.zeros(cells.shape, np.uint16)
+    for place, (region, inside) in enumerate(zip(body.regions, regions, strict=True)):
+        selected = inside & cells
+        if not selected.any():
+            raise SceneError(f"bodies.{body.name}.regions.{place}: has no jelly cube of the body")
+        numbers[selected] = names.index(region.material)
+    used, of_cell = np.unique(numbers[cells], return_inverse=True)
+    if len(used) > MAX_MATERIALS:
+        raise SceneError(f"bodies.{body.name}: has {len(used)} materials; a body can have {MAX_MATERIALS}")
+    materials = np.zeros(cells.shape, np.uint8)
+    materials[cells] = of_cell
+    return [names[number] for number in used], materials if len(used) > 1 else None
 
 
 @dataclass(frozen=True)
@@ -162,6 +217,8 @@ class VoxelizedModel:
     watertight: bool
     model: LoadedModel
     """What it was made from, in the frame of the body."""
+    regions: list[np.ndarray]
+    """Cells of the grid in each of the body's regions, bool [nx, ny, nz]."""
     mesh_volume: float
     """m^3; of a closed mesh that does not intersect itself, the volume inside."""
     warnings: list[str]
@@ -210,9 +267,45 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
         )
     for note in notes:
         log.warning("%s: %s", body.file, note)
+    regions = [
+        region.grid_cells(grid.cells.shape, grid.origin, grid.cell_size)
+        if region.grid is not None
+        else _cells_in_model(region, body, grid, scale, up_axis)
+        for region in body.regions
+    ]
     # By the divergence theorem.
     volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6
-    return VoxelizedModel(grid, bool(mesh.is_watertight), model, volume, notes)
+    return VoxelizedModel(grid, bool(mesh.is_watertight), model, regions, volume, notes)
+
+
+def _cells_in_model(region: ModelRegion, body: ModelBody, grid: VoxelGrid, scale: float, up_axis: str) -> np.ndarray:
+    """Return the cells of a body's grid whose centres are inside the model of a region, bool [nx, ny, nz].
+
+    Args:
+        region: names the model, which is in the units of the body's.
+        body: has the grid.
+        grid: in metres.
+        scale: metres per such unit.
+        up_axis: as for ``voxelize_model``.
+
+    Raises:
+        InputError: the model cannot be used.
+    """
+    from .meshes import load_model
+    from .voxelize import MAX_CELLS, find_inside
+
+    assert region.file is not None
+    mesh = load_model(region.file, up_axis=up_axis, prim=region.prim).scaled(scale).mesh
+    corners = np.concatenate([mesh.bounds, [grid.origin, grid.origin + np.array(grid.cells.shape) * grid.cell_size]])
+    if (cells := np.ptp(corners, axis=0).max() / grid.cell_size) > MAX_CELLS:
+        raise SceneError(
+            f"{region.file}: with bodies.{body.name} the model is {cells:,.0f} of its cells long, and at most "
+            f"{MAX_CELLS:,} can be searched: is it in the same units?"
+        )
+    inside, notes = find_inside(mesh, grid, keep_thin_parts=body.keep_thin_parts)
+    for note in notes:
+        log.warning("%s: %s", region.file, note)
+    return inside
 
 
 def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:

@@ -191,6 +191,21 @@ class Pin(Table):
         return self
 
 
+class Region(Table):
+    """Some jelly cubes of a body that are of another material than the rest."""
+
+    selectors: ClassVar[tuple[str, ...]]
+    """Keys of which each region has one."""
+
+    material: Name = Field(description="one of [materials]")
+
+    @model_validator(mode="after")
+    def _one_way_is_chosen(self) -> Self:
+        if sum(getattr(self, key) is not None for key in self.selectors) != 1:
+            raise PydanticCustomError("region", f"give {' or '.join(self.selectors)}")
+        return self
+
+
 class Body(Table):
     """What all bodies have: a name, a material, a placement and, maybe, particles that stay where they are."""
 
@@ -243,6 +258,21 @@ class CubeBody(Body):
 DEFAULT_CELL_SIZE = 0.1
 
 
+class VoxelsRegion(Region):
+    """Cubes of a body of voxels by what is drawn, or by their number in its file."""
+
+    selectors = ("symbol", "value")
+    symbol: str | None = Field(None, description="what its cubes are drawn with in layers, one character")
+    value: int | None = Field(None, strict=True, ge=1, description="number of its cubes among the cells of the file")
+
+    @field_validator("symbol")
+    @classmethod
+    def _symbol_is_a_character_of_its_own(cls, symbol: str | None) -> str | None:
+        if symbol is not None and (len(symbol) != 1 or symbol in "#."):
+            raise PydanticCustomError("symbol", "must be one character, and not # or .")
+        return symbol
+
+
 class VoxelsBody(Body):
     """Jelly cubes on a grid, drawn in the scene around the origin, or from a file."""
 
@@ -251,17 +281,18 @@ class VoxelsBody(Body):
         None,
         min_length=1,
         description="layers along +y from the bottom up; each a list of rows along +z; each row a string along +x "
-        "with # for a jelly cube and . for none",
+        "with # for a jelly cube, . for none and the symbols of regions",
     )
     file: Path | None = Field(
         None,
-        description="instead of layers an .npz file, relative to the scene file: cells [x, y, z], and maybe origin, "
-        "the lowest corner, and cell_size; `warpjelly voxelize` writes such files",
+        description="instead of layers an .npz file, relative to the scene file: cells [x, y, z], 0 where there is no "
+        "cube, and maybe origin, the lowest corner, and cell_size; `warpjelly voxelize` writes such files",
     )
     cell_size: Length | None = Field(None, description="edge of one jelly cube, m; 0.1 unless a file has its own")
     particles_per_edge: int = Field(
         2, strict=True, ge=2, le=256, description="particles along an edge of each jelly cube"
     )
+    regions: list[VoxelsRegion] = Field([], description="cubes of other materials; of several, the last one counts")
 
     @field_validator("layers")
     @classmethod
@@ -276,9 +307,7 @@ class VoxelsBody(Body):
                 if len(row) != width:
                     why = f"row {z} of layer {y} has {len(row)} cells, row 0 of layer 0 has {width}"
                     raise PydanticCustomError("layers", why)
-            if stray := set("".join(layer)) - {"#", "."}:
-                raise PydanticCustomError("layers", f"layer {y} has {min(stray)!r}; use # for a cube and . for none")
-        if not any("#" in row for layer in layers for row in layer):
+        if not any(set(row) - {"."} for layer in layers for row in layer):
             raise PydanticCustomError("layers", "the grid has no jelly cube (#)")
         return layers
 
@@ -292,27 +321,53 @@ class VoxelsBody(Body):
         if (self.layers is None) == (self.file is None):
             raise PydanticCustomError("layers", "give either layers or file")
         if self.file is not None:
-            self.grid()
+            _read_grid(self.file)
+        return self
+
+    @model_validator(mode="after")
+    def _regions_go_with_the_grid(self) -> Self:
+        key, other = ("symbol", "layers") if self.layers is not None else ("value", "file")
+        for number, region in enumerate(self.regions):
+            if getattr(region, key) is None:
+                refuse(f"regions.{number}", None, f"give {key}, which goes with {other}")
+        symbols = [region.symbol for region in self.regions]
+        for y, layer in enumerate(self.layers or []):
+            if stray := set("".join(layer)) - {"#", ".", *symbols}:
+                why = f"layer {y} has {min(stray)!r}; use # for a cube, . for none, or the symbol of one of its regions"
+                refuse("layers", self.layers, why)
         return self
 
     def grid(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Return the occupied cells, bool [x, y, z]; the lowest corner of the grid, [3], m; the edge of a cell, m."""
         if self.file is not None:
-            return _read_grid(self.file, self.cell_size)
-        filled = np.array([[[c == "#" for c in row] for row in layer] for layer in self.layers or []])
-        cells = np.ascontiguousarray(filled.transpose(2, 0, 1))
+            numbers, origin, own = _read_grid(self.file)
+            scale = 1.0 if self.cell_size is None else self.cell_size / own
+            return numbers != 0, scale * origin, scale * own
+        cells = self._drawing() != "."
         cell_size = DEFAULT_CELL_SIZE if self.cell_size is None else self.cell_size
         return cells, -np.array(cells.shape) * cell_size / 2, cell_size
 
+    def region_cells(self) -> Iterator[np.ndarray]:
+        """Yield the cells of each region, bool [x, y, z]."""
+        if self.regions:
+            marks = self._drawing() if self.file is None else _read_grid(self.file)[0]
+            for region in self.regions:
+                yield marks == (region.value if region.symbol is None else region.symbol)
 
-def _read_grid(file: Path, cell_size: float | None) -> tuple[np.ndarray, np.ndarray, float]:
-    """Read the cells, the origin and the cell size of an .npz file; a given cell size scales all of it."""
+    def _drawing(self) -> np.ndarray:
+        """Return the characters of the layers, [x, y, z]."""
+        drawn = np.array([[list(row) for row in layer] for layer in self.layers or []])
+        return np.ascontiguousarray(drawn.transpose(2, 0, 1))
+
+
+def _read_grid(file: Path) -> tuple[np.ndarray, np.ndarray, float]:
+    """Read the cells [x, y, z], 0 where empty, the origin [3] and the cell size of an .npz file."""
     try:
         with np.load(file, allow_pickle=False) as data:
-            cells = data["cells"] != 0
+            cells = data["cells"]
             own = float(data["cell_size"]) if "cell_size" in data else DEFAULT_CELL_SIZE
             origin = data["origin"].astype(float) if "origin" in data else -np.array(cells.shape) * own / 2
-        if cells.ndim != 3 or not cells.any():
+        if cells.ndim != 3 or not (cells != 0).any():
             raise ValueError(f"cells must be [x, y, z] with one of them occupied, not {list(cells.shape)}")
         if not MIN_LENGTH <= own <= MAX_LENGTH or origin.shape != (3,) or not np.abs(origin).max() <= MAX_LENGTH:
             raise ValueError(f"origin and cell_size must be lengths in m, not {origin.tolist()} and {own}")
@@ -320,8 +375,7 @@ def _read_grid(file: Path, cell_size: float | None) -> tuple[np.ndarray, np.ndar
     except Exception as error:
         what = {"file": str(file), "why": str(error) or type(error).__name__}
         raise PydanticCustomError("grid", "{file}: not a grid of voxels: {why}", what) from error
-    scale = 1.0 if cell_size is None else cell_size / own
-    return cells, scale * origin, scale * own
+    return cells, origin, own
 
 
 def _existing(file: Path, info: ValidationInfo) -> Path:
@@ -330,6 +384,53 @@ def _existing(file: Path, info: ValidationInfo) -> Path:
     if not file.is_file():
         raise PydanticCustomError("file", "no such file ({path})", {"path": str(file)})
     return file
+
+
+class ModelRegion(Region):
+    """Cubes of a model by another model, or by a grid."""
+
+    selectors = ("file", "grid")
+    file: Path | None = Field(
+        None,
+        description="another model, in the frame and the units of the body's, relative to the scene file: the cubes "
+        "whose centres are inside",
+    )
+    prim: str | None = Field(
+        None, description="of a USD file, the prim whose meshes are read; the default prim unless given"
+    )
+    grid: Path | None = Field(
+        None,
+        description="an .npz file, relative to the scene file: cells [x, y, z], origin and cell_size in m, as of a "
+        "body of voxels in the same place: the cubes whose centres are in its cells that are not 0",
+    )
+    value: int | None = Field(None, strict=True, ge=1, description="of a grid, only cells with this number")
+
+    @field_validator("file", "grid", mode="after")
+    @classmethod
+    def _files_are_relative_to_the_scene(cls, file: Path | None, info: ValidationInfo) -> Path | None:
+        return None if file is None else _existing(file, info)
+
+    @model_validator(mode="after")
+    def _keys_go_together(self) -> Self:
+        if self.prim is not None and (self.file is None or self.file.suffix.lower() not in USD_EXTENSIONS):
+            refuse("prim", self.prim, f"only USD files have prims: {' '.join(USD_EXTENSIONS)}")
+        if self.value is not None and self.grid is None:
+            refuse("value", self.value, "goes with grid alone")
+        if self.grid is not None:
+            _read_grid(self.grid)
+        return self
+
+    def grid_cells(self, shape: tuple[int, ...], origin: np.ndarray, cell_size: float) -> np.ndarray:
+        """Return which cells of a grid are in this region's grid, bool [shape]; origin [3] and cell size in m."""
+        assert self.grid is not None
+        numbers, own_origin, own_size = _read_grid(self.grid)
+        selected = np.pad(numbers != 0 if self.value is None else numbers == self.value, 1)
+        # The cell that has each centre, along each axis; those beyond the grid are in the empty layer around it.
+        places = [
+            np.floor((low + (np.arange(count) + 0.5) * cell_size - own_low) / own_size).clip(-1, own_count).astype(int)
+            for count, low, own_count, own_low in zip(shape, origin, numbers.shape, own_origin, strict=True)
+        ]
+        return selected[np.ix_(*(place + 1 for place in places))]
 
 
 class ModelBody(Body):
@@ -363,6 +464,7 @@ class ModelBody(Body):
     pieces: Literal["all", "largest"] = Field(
         "all", description="of pieces that no face joins, keep each, moving by itself, or the largest alone"
     )
+    regions: list[ModelRegion] = Field([], description="cubes of other materials; of several, the last one counts")
 
     @field_validator("file", mode="after")
     @classmethod
@@ -823,9 +925,12 @@ class Scene(Table):
                 if part.name in [earlier.name for earlier in parts[:i]]:
                     refuse(f"{key}.{i}.name", part.name, "this name is taken; names must differ")
         for i, body in enumerate(self.bodies):
-            if body.material not in self.materials:
-                known = ", ".join(self.materials)
-                refuse(f"bodies.{i}.material", body.material, f"no such material; materials of this scene: {known}")
+            named = {f"bodies.{i}.material": body.material}
+            regions = body.regions if isinstance(body, VoxelsBody | ModelBody) else []
+            named |= {f"bodies.{i}.regions.{k}.material": region.material for k, region in enumerate(regions)}
+            for key, name in named.items():
+                if name not in self.materials:
+                    refuse(key, name, f"no such material; materials of this scene: {', '.join(self.materials)}")
             material = self.materials[body.material]
             if not body.has_volume and material.density is not None:
                 why = f"it has a density, but a {body.type} has no volume: use particle_mass, and law strain or hooke"

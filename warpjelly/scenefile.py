@@ -144,7 +144,7 @@ def _explain(error: ValidationError) -> str:
     if value is not None and not isinstance(value, Mapping):
         for problem in tried:
             what += ", or " + problem["msg"].removeprefix("Input should be ")
-    if first["type"] == "list_type" and first["loc"][-1] in ("bodies", "colliders", "fields", "pinned"):
+    if first["type"] == "list_type" and first["loc"][-1] in ("bodies", "colliders", "fields", "pinned", "regions"):
         header = ".".join(part for part in key.split(".") if not part.isdigit())
         what += f"; its tables are headed [[{header}]], with two brackets"
     if first["type"] in ("unknown_key", "scene"):

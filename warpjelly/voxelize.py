@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 import trimesh
@@ -25,6 +25,8 @@ METHODS = {
 }
 # Planes of bits that count crossings.
 PARITY, WINDING = 1, 4
+# A grid and a mesh in it are together at most this many cells long; coordinates in subcells are exact up to there.
+MAX_CELLS = 5000
 # The coarse grid on which a closed mesh is looked at before a method is chosen.
 LOOK_RESOLUTION = 64
 
@@ -122,7 +124,7 @@ def choose_method(triangles: np.ndarray, *, closed: bool, device: str = "cpu") -
     """
     if not closed:
         return "vote", ["is not watertight"]
-    grid = _Grid(triangles, LOOK_RESOLUTION, device)
+    grid = _Grid.around(triangles, LOOK_RESOLUTION, device)
     seen = grid.fill(WINDING).seen
     # Modulo 16: 1 to 7 times around, or -8 to -1 times.
     faults = []
@@ -156,7 +158,32 @@ def voxelize(
         keep_thin_parts: occupy the cells, too, that thin parts of the surface pass through.
         device: where to scan-convert.
     """
-    grid = _Grid(triangles, resolution, device)
+    return _fill(triangles, _Grid.around(triangles, resolution, device), method, keep_thin_parts)
+
+
+def find_inside(
+    mesh: trimesh.Trimesh, grid: VoxelGrid, *, keep_thin_parts: bool = False, device: str = "cpu"
+) -> tuple[np.ndarray, list[str]]:
+    """Find the cells of a given grid whose centres are inside another mesh, by the method that suits it.
+
+    Args:
+        mesh: as from ``load_mesh``, in the frame and units of the grid; together they are at most MAX_CELLS long.
+        grid: only its place, shape and cell size count.
+        keep_thin_parts: as for ``voxelize``.
+        device: where to scan-convert.
+
+    Returns:
+        The cells, bool [nx, ny, nz], and what the user should know of the mesh, a sentence each.
+    """
+    triangles = np.asarray(mesh.triangles)
+    method, faults = choose_method(triangles, closed=bool(mesh.is_watertight), device=device)
+    given = _Grid(triangles, np.array(grid.cells.shape), grid.origin, grid.cell_size, device)
+    notes = [f"the mesh {' and '.join(faults)}; method {method}: {METHODS[method]}"] if faults else []
+    return _fill(triangles, given, method, keep_thin_parts).cells, notes
+
+
+def _fill(triangles: np.ndarray, grid: _Grid, method: str, keep_thin_parts: bool) -> VoxelGrid:
+    """Find the cells of a grid that are inside, as ``voxelize`` says."""
     if method == "vote":
         filled = _vote(triangles, grid)
     else:
@@ -239,18 +266,25 @@ class _Filled:
 
 
 class _Grid:
-    """The grid around a mesh, and the mesh in its cells."""
+    """A grid, and a mesh in its cells."""
 
-    def __init__(self, triangles: np.ndarray, resolution: int, device: str) -> None:
+    def __init__(
+        self, triangles: np.ndarray, shape: np.ndarray, origin: np.ndarray, cell_size: float, device: str
+    ) -> None:
         start_warp()
         self.device = device
+        self.shape, self.origin, self.cell_size = shape, origin, cell_size
+        self.snapped = np.rint((triangles - origin) * (voxels.SUBCELLS / cell_size)).astype(np.int64)
+
+    @classmethod
+    def around(cls, triangles: np.ndarray, resolution: int, device: str) -> Self:
+        """Return the grid around a mesh, of so many cells along the longest edge."""
         lower, upper = triangles.min(axis=(0, 1)).astype(float), triangles.max(axis=(0, 1)).astype(float)
-        self.cell_size = float((upper - lower).max()) / resolution
+        cell_size = float((upper - lower).max()) / resolution
         # The cubic grid less the layers on both sides that the mesh does not reach, as long as there is one left.
-        skipped = np.floor((resolution - (upper - lower) / self.cell_size) / 2 + 1e-9).astype(int)
-        self.shape = resolution - 2 * np.minimum(skipped, (resolution - 1) // 2)
-        self.origin = (lower + upper) / 2 - self.shape * self.cell_size / 2
-        self.snapped = np.rint((triangles - self.origin) * (voxels.SUBCELLS / self.cell_size)).astype(np.int64)
+        skipped = np.floor((resolution - (upper - lower) / cell_size) / 2 + 1e-9).astype(int)
+        shape = resolution - 2 * np.minimum(skipped, (resolution - 1) // 2)
+        return cls(triangles, shape, (lower + upper) / 2 - shape * cell_size / 2, cell_size, device)
 
     def fill(self, planes: int, axis: int = 2) -> _Filled:
         """Count crossings with rays along an axis; cells and columns are those of axes turned until it is z."""
