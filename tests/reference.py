@@ -89,6 +89,39 @@ def build(cells: np.ndarray, particles_per_edge: int = 2) -> ReferenceLattice:
     return ReferenceLattice(sorted(set(particle.values()), key=lambda key: (key[0], min(key[1]))), springs)
 
 
+def name_particles(vertices: np.ndarray, ends: np.ndarray, kinds: np.ndarray) -> list[Key]:
+    """Name each particle by its place and the unit cells that share it, as its body diagonals say.
+
+    Each body diagonal lies in one unit cell, and a cell's four of them end in its eight corners.
+    """
+    owners: list[set[Vertex]] = [set() for _ in vertices]
+    for i, j in ends[kinds == 2]:
+        x, y, z = np.minimum(vertices[i], vertices[j])
+        owners[i].add((int(x), int(y), int(z)))
+        owners[j].add((int(x), int(y), int(z)))
+    return [((int(x), int(y), int(z)), frozenset(cells)) for (x, y, z), cells in zip(vertices, owners, strict=True)]
+
+
+def cells_in(spring: frozenset[Key]) -> frozenset[Vertex]:
+    """Return the unit cells that contain both ends of a spring."""
+    a, b = spring
+    return a[1] & b[1]
+
+
+def springs_under(lattice: ReferenceLattice) -> dict[frozenset[Key], list[frozenset[Key]]]:
+    """Return both structural springs under each bend spring; of two ways around a gap, that of the last cell."""
+    found = {}
+    for ends in [ends for ends, kind in lattice.springs.items() if kind == 3]:
+        a, b = sorted(ends, key=lambda key: key[0])
+        ways = [
+            [frozenset((a, middle)), frozenset((middle, b))]
+            for middle in lattice.keys
+            if shift(a[0], b[0]) == shift((0, 0, 0), middle[0], 2) and a[1] & middle[1] and b[1] & middle[1]
+        ]
+        found[ends] = max(ways, key=lambda way: max(cells_in(way[0])))
+    return found
+
+
 def spring_forces(
     x: np.ndarray, v: np.ndarray, ends: np.ndarray, rest: np.ndarray, k: np.ndarray, d: np.ndarray
 ) -> np.ndarray:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
-from reference import Key, build, unit_cells
+from reference import build, name_particles, unit_cells
 from worlds import make_scene, make_voxels
 
 from warpjelly.kernels.springs import MAX_SPAN
@@ -31,20 +31,6 @@ def build_on_grid(cells: np.ndarray, particles_per_edge: int = 2) -> tuple[Latti
     return lattice, vertices.astype(int)
 
 
-def name_particles(lattice: Lattice, vertices: np.ndarray) -> list[Key]:
-    """Name each particle by its place and the unit cells that share it, as its body diagonals say.
-
-    Each body diagonal lies in one unit cell, and a cell's four of them end in its eight corners.
-    """
-    owners: list[set[tuple[int, int, int]]] = [set() for _ in vertices]
-    ends, kinds = lattice.springs()
-    for i, j in ends[kinds == 2]:
-        x, y, z = np.minimum(vertices[i], vertices[j])
-        owners[i].add((int(x), int(y), int(z)))
-        owners[j].add((int(x), int(y), int(z)))
-    return [((int(x), int(y), int(z)), frozenset(cells)) for (x, y, z), cells in zip(vertices, owners, strict=True)]
-
-
 def check(cells: np.ndarray, particles_per_edge: int) -> None:
     """Compare particles, springs and surface of a grid with the dictionaries, and its counts with all of them."""
     lattice, vertices = build_on_grid(cells, particles_per_edge)
@@ -52,7 +38,7 @@ def check(cells: np.ndarray, particles_per_edge: int) -> None:
     units = unit_cells(cells, particles_per_edge)
 
     # The same particles, none twice, in scan order (z fastest).
-    keys = name_particles(lattice, vertices)
+    keys = name_particles(vertices, *lattice.springs())
     assert keys == expected.keys
     assert [len(key[1]) for key in keys] == lattice.cell_counts[0].tolist()
     assert lattice.cell_counts.sum() == 8 * len(units)

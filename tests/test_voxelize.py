@@ -13,7 +13,15 @@ from test_models import winding_numbers
 
 from warpjelly.kernels.voxels import SUBCELLS
 from warpjelly.meshes import load_mesh
-from warpjelly.voxelize import VoxelGrid, choose_method, find_pieces, keep_largest_piece, voxelize, voxelize_mesh
+from warpjelly.voxelize import (
+    VoxelGrid,
+    choose_method,
+    find_pieces,
+    keep_largest_piece,
+    voxelize,
+    voxelize_mesh,
+    voxelize_on_grid,
+)
 
 MODELS = Path(__file__).parents[1] / "scenes" / "models"
 
@@ -123,6 +131,30 @@ def test_random_polyhedra_match_the_exact_test(seed: int, device: str) -> None:
     united = (hulls[0] + hulls[1] + hulls[2]).to_mesh64()
     mesh = trimesh.Trimesh(united.vert_properties, united.tri_verts.astype(np.int64), process=False)
     assert check(mesh, 9, device).cells.any()
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_meshes_match_the_exact_test_on_a_grid_of_another(seed: int, device: str) -> None:
+    """Find the cells of a given grid in random hulls that are in it, around it or reach out of it on some sides."""
+    rng = np.random.default_rng(seed)
+    grid = voxelize(np.asarray(turned(trimesh.creation.box((5.0, 4.0, 3.0)), seed).triangles), 9, device=device)
+    center = grid.origin + np.array(grid.cells.shape) / 2 * grid.cell_size
+    found = []
+    for size in (0.5, 2.0, 8.0):
+        points = rng.normal(size=(10, 3)) * size + center + rng.normal(size=3)
+        hull = Manifold.hull_points(points).to_mesh64()
+        mesh = trimesh.Trimesh(hull.vert_properties, hull.tri_verts.astype(np.int64), process=False)
+        cells, notes = voxelize_on_grid(mesh, grid, device=device)
+        snapped = np.rint((np.asarray(mesh.triangles) - grid.origin) * (SUBCELLS / grid.cell_size)).astype(np.int64)
+        np.testing.assert_array_equal(cells, find_inside(snapped, grid.cells.shape))
+        assert notes == []
+        found.append(cells.mean())
+    assert found[0] < found[2]
+    # The hull with a hole: rays through it are left out of the vote, wherever it is, and all others are right.
+    mesh.update_faces(np.arange(len(mesh.faces)) > 0)
+    voted, (note,) = voxelize_on_grid(mesh, grid, device=device)
+    assert "not watertight; method vote" in note
+    np.testing.assert_array_equal(voted, cells)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -10,6 +10,7 @@ from warpjelly.model import build
 from warpjelly.plan import plan_scene
 
 E, DENSITY = 2e4, 900.0
+YOUNG = {"law": "young", "youngs_modulus": E, "density": DENSITY, "damping_time": 3e-3}
 # Springs of a lattice in the notation of crystals: along the edge, the face diagonal and the body diagonal of a cell.
 DIRECTIONS = {"100": (1, 0, 0), "110": (1, 1, 0), "111": (1, 1, 1)}
 
@@ -18,8 +19,12 @@ class Solid:
     """A body of a scene as springs between particles, read back from the model that the simulator uses."""
 
     def __init__(self, cells: np.ndarray, *, edge: float, **material: object) -> None:
-        material = material or {"law": "young", "youngs_modulus": E, "density": DENSITY, "damping_time": 3e-3}
-        scene = make_scene(materials={"jelly": material}, bodies=[make_voxels(cells, cell_size=edge)])
+        material = material or YOUNG
+        # Cells with the numbers 2, 3, ... are of that many times the modulus.
+        regions = [{"symbol": "_abcdefgh"[n - 1], "material": f"jelly_{n}"} for n in np.unique(cells) if n > 1]
+        body = make_voxels(cells, cell_size=edge, regions=regions)
+        harder = {f"jelly_{n}": {**YOUNG, "youngs_modulus": n * E} for n in range(2, 10)}
+        scene = make_scene(materials={"jelly": material} | harder, bodies=[body])
         model, state = build(plan_scene(scene), device="cpu")
         spans = model.spans.numpy()
         run = np.concatenate([np.arange(count) for count in spans[:, 2]])
@@ -123,6 +128,51 @@ def test_bars_stretch_as_the_continuum(across: int) -> None:
     np.testing.assert_allclose(stretches, expected, rtol=30**4 * 2.0**-52)
 
 
+@pytest.mark.parametrize("across", [2, 4, 6])
+def test_bars_of_two_materials_side_by_side_stretch_as_the_continuum(across: int) -> None:
+    """Pull a bar whose upper half is 9 times as hard, each half by its share: the elongation is F L/(E1 A1 + E2 A2)."""
+    cells = np.ones((across * SLENDERNESS, across, across), int)
+    cells[:, across // 2 :] = 9
+    edge = WIDTH / across
+    bar = Solid(cells, edge=edge)
+    # Both halves contract sideways alike, having one Poisson's ratio: the continuum's strain is uniform.
+    modulus, strain = E * cells[0], 0.01
+    load = np.zeros((1, *bar.x.shape))
+    place = np.rint(bar.x[:, 1:] / edge + across / 2).astype(int)
+    for corner in np.ndindex(2, 2):
+        around = np.pad(modulus, 1)[tuple((place + corner).T)]
+        load[0, :, 0] += (
+            around * strain * edge**2 / 4 * np.sign(bar.x[:, 0]) * np.isclose(np.abs(bar.x[:, 0]), LENGTH / 2)
+        )
+    assert load[0, :, 0].max() > 0 and abs(load.sum()) < 1e-12 * np.abs(load).sum()
+    fixed = np.zeros(bar.x.shape, bool)
+    corner, beside, above = np.flatnonzero(np.isclose(bar.x[:, 0], -LENGTH / 2))[[0, across, -1 - across]]
+    fixed[corner] = fixed[beside, :2] = fixed[above, 0] = True
+    found = bar.solve(load, fixed)[0]
+    expected = (bar.x - bar.x[corner]) * np.array([strain, -strain / 4, -strain / 4])
+    # As for a bar of one material.
+    np.testing.assert_allclose(found, expected, rtol=0, atol=30**4 * 2.0**-52 * strain * LENGTH)
+
+
+@pytest.mark.parametrize("across", [1, 2, 4])
+def test_bars_of_two_materials_in_series_stretch_as_the_continuum(across: int) -> None:
+    """Pull a bar, held sideways, whose right part is 9 times as hard: the strains are stress / (1.2 E)."""
+    cells = np.ones((across * SLENDERNESS, across, across), int)
+    cells[2 * across :] = 9
+    bar = Solid(cells, edge=WIDTH / across)
+    _, left, right = make_bar(across)
+    load = np.zeros((1, *bar.x.shape))
+    load[0, :, 0] = 2.0 * right
+    fixed = np.repeat([[False, True, True]], len(bar.x), axis=0)
+    fixed[:, 0] = left > 0
+    found = bar.solve(load, fixed)[0, :, 0]
+    # Uniaxial strain: C11 = 1.2 E.
+    stress, interface = 2.0 / WIDTH**2, 2 * WIDTH
+    along = bar.x[:, 0] + LENGTH / 2
+    expected = stress / (1.2 * E) * (np.minimum(along, interface) + np.maximum(along - interface, 0) / 9)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=30**4 * 2.0**-52 * expected.max())
+
+
 def test_a_cantilever_converges_with_the_resolution() -> None:
     """Bend a clamped bar by a force at its tip: closer to Timoshenko's beam with every refinement, never softer."""
     errors = {}
@@ -144,12 +194,17 @@ def test_a_cantilever_converges_with_the_resolution() -> None:
     assert 0 < errors[6] < 0.05
 
 
+@pytest.mark.parametrize("hardest", [1, 8])
 @pytest.mark.parametrize("seed", range(8))
-def test_every_shape_has_the_same_modulus_in_all_directions(seed: int) -> None:
-    """Strain random shapes of cells alike everywhere: E along 100, 110 and 111, and Poisson's ratio 1/4."""
+def test_every_shape_has_the_same_modulus_in_all_directions(seed: int, hardest: int) -> None:
+    """Strain random shapes of cells alike everywhere: E along 100, 110 and 111, and Poisson's ratio 1/4.
+
+    Of several materials, the mean of the cells' moduli takes the place of E.
+    """
     rng = np.random.default_rng(seed)
-    body = Solid(rng.random((3, 4, 3)) < rng.uniform(0.2, 1.0), edge=0.2)
-    elasticity = body.elasticity()
+    cells = (rng.random((3, 4, 3)) < rng.uniform(0.2, 1.0)) * rng.integers(1, hardest + 1, (3, 4, 3))
+    body = Solid(cells, edge=0.2)
+    elasticity = body.elasticity() / cells[cells > 0].mean()
     lame = 0.4 * E
     identity = np.eye(3)
     expected = lame * sum(
@@ -162,11 +217,13 @@ def test_every_shape_has_the_same_modulus_in_all_directions(seed: int) -> None:
         np.testing.assert_allclose(directional_modulus(elasticity, direction), [E, 0.25], rtol=1e-12)
 
 
+@pytest.mark.parametrize("hardest", [1, 8])
 @pytest.mark.parametrize("seed", range(8))
-def test_every_cell_pulls_its_corners_as_the_continuum(seed: int) -> None:
+def test_every_cell_pulls_its_corners_as_the_continuum(seed: int, hardest: int) -> None:
     """Stretch random shapes along their axes: the stress s pulls each corner of each cell with (h^2/4) s (1, 1, 1)."""
     rng = np.random.default_rng(seed)
     h, cells = 0.2, rng.random((4, 4, 5)) < rng.uniform(0.2, 1.0)
+    cells = cells * rng.integers(1, hardest + 1, cells.shape)
     body = Solid(cells, edge=h)
     # Sheared, a body diagonal also pulls across the plane of shear, which only its neighbours balance.
     strain = np.diag(rng.normal(size=3))
@@ -179,9 +236,10 @@ def test_every_cell_pulls_its_corners_as_the_continuum(seed: int) -> None:
         np.add.at(found, tuple(vertex[body.ends[:, end]].T), sign * tension[:, None] * body.direction)
     for cell in np.argwhere(cells):
         for corner in np.ndindex(2, 2, 2):
-            expected[tuple(cell + corner)] += h**2 / 4 * stress @ (1.0 - 2.0 * np.array(corner))
+            pull = stress * cells[tuple(cell)]
+            expected[tuple(cell + corner)] += h**2 / 4 * pull @ (1.0 - 2.0 * np.array(corner))
     # Up to 26 springs at a particle, each far below E h^2.
-    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * E * h**2)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-12 * hardest * E * h**2)
 
 
 def test_mass_and_damping_follow_the_volume_and_the_stiffness() -> None:

@@ -37,8 +37,8 @@ def make_scene(*, solver: dict[str, Any] | None = None, **changes: Any) -> Scene
 
 
 def make_voxels(cells: np.ndarray, **changes: Any) -> dict[str, Any]:
-    """Return a body of jelly cubes from occupied cells [x, y, z]."""
-    layers = [["".join(".#"[int(c)] for c in row) for row in layer] for layer in cells.transpose(1, 2, 0)]
+    """Return a body of jelly cubes from cells [x, y, z]: 0 for none, 1 for #, 2 to 9 for symbols a to h of regions."""
+    layers = [["".join(".#abcdefgh"[int(c)] for c in row) for row in layer] for layer in cells.transpose(1, 2, 0)]
     return {"type": "voxels", "material": "jelly", "layers": layers, **changes}
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -292,7 +292,7 @@ def _cells_in_model(region: ModelRegion, body: ModelBody, grid: VoxelGrid, scale
         InputError: the model cannot be used.
     """
     from .meshes import load_model
-    from .voxelize import MAX_CELLS, find_inside
+    from .voxelize import MAX_CELLS, voxelize_on_grid
 
     assert region.file is not None
     mesh = load_model(region.file, up_axis=up_axis, prim=region.prim).scaled(scale).mesh
@@ -302,7 +302,7 @@ def _cells_in_model(region: ModelRegion, body: ModelBody, grid: VoxelGrid, scale
             f"{region.file}: with bodies.{body.name} the model is {cells:,.0f} of its cells long, and at most "
             f"{MAX_CELLS:,} can be searched: is it in the same units?"
         )
-    inside, notes = find_inside(mesh, grid, keep_thin_parts=body.keep_thin_parts)
+    inside, notes = voxelize_on_grid(mesh, grid, keep_thin_parts=body.keep_thin_parts)
     for note in notes:
         log.warning("%s: %s", region.file, note)
     return inside

@@ -161,7 +161,7 @@ def voxelize(
     return _fill(triangles, _Grid.around(triangles, resolution, device), method, keep_thin_parts)
 
 
-def find_inside(
+def voxelize_on_grid(
     mesh: trimesh.Trimesh, grid: VoxelGrid, *, keep_thin_parts: bool = False, device: str = "cpu"
 ) -> tuple[np.ndarray, list[str]]:
     """Find the cells of a given grid whose centres are inside another mesh, by the method that suits it.
