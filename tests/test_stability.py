@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from reference import World
 from test_scenes import NAMES, SCENES
-from worlds import make_material, make_scene, set_state
+from worlds import make_material, make_scene, make_voxels, set_state
 
 from warpjelly import stability
 from warpjelly.errors import DivergedError, SceneError
@@ -144,11 +144,20 @@ MATERIALS = {
 }
 
 
-@pytest.mark.parametrize("name", MATERIALS)
+def make_blocks() -> Scene:
+    """Return a scene of one body of two materials, both damped alike, cell by cell in turn."""
+    numbers = np.indices((3, 3, 3)).sum(axis=0) % 2 + 1
+    regions = [{"symbol": "a", "material": "bone"}]
+    materials = {"jelly": make_material(400.0, 0.6), "bone": make_material(8000.0, 12.0, particle_mass=0.03)}
+    return make_scene(bodies=[make_voxels(numbers, regions=regions)], materials=materials)
+
+
+@pytest.mark.parametrize("name", [*MATERIALS, "two in one body"])
 @pytest.mark.parametrize("integrator", INTEGRATORS)
 def test_the_limit_is_neither_unsafe_nor_timid(name: str, integrator: str) -> None:
     """Stay bounded for 8192 linear steps at 0.95 of the limit, and blow up at 1.3 of it."""
-    simulator = Simulator(make_cube(4, MATERIALS[name]), device="cpu")
+    scene = make_cube(4, MATERIALS[name]) if name in MATERIALS else make_blocks()
+    simulator = Simulator(scene, device="cpu")
     limit = simulator.step_limits(contacts=False)[integrator]
     if name == "undamped" and integrator in ("explicit_euler", "rk2"):
         assert limit is None

@@ -313,11 +313,23 @@ def _connect(grid: Grid, unit: float, weighted: bool) -> tuple[np.ndarray, Sprin
     pure = np.flatnonzero(used[:MIXED])
     rows = np.zeros((len(pure), MAX_MATERIALS), np.int32)
     rows[np.arange(len(pure)), pure >> MATERIAL_SHIFT] = pure % (1 << MATERIAL_SHIFT) | 1 << MATERIAL_SHIFT
-    mixed, number = np.unique(mixed, axis=0, return_inverse=True)
-    class_of_label = np.concatenate([np.cumsum(used[:MIXED]) - 1, len(pure) + number.reshape(-1)])
+    mixed, number = _distinct_rows(mixed)
+    class_of_label = np.concatenate([np.cumsum(used[:MIXED]) - 1, len(pure) + number])
     spans[:, 3] = class_of_label[spans[:, 3]]
     rows = np.concatenate([rows, mixed])[:, : grid.material_count]
     return spans, _decode_classes(rows, unit, weighted)
+
+
+def _distinct_rows(rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the distinct rows of a table of numbers below 2^16, and which of them each is.
+
+    Going by columns takes a tenth of the time of comparing whole rows.
+    """
+    number = np.zeros(len(rows), np.int64)
+    for column in rows.T:
+        _, number = np.unique(number << 16 | column, return_inverse=True)
+    _, first = np.unique(number, return_index=True)
+    return rows[first], number
 
 
 def _decode_classes(rows: np.ndarray, unit: float, weighted: bool) -> SpringClasses:
