@@ -264,6 +264,18 @@ def test_a_grid_selects_cells_by_their_place(tmp_path: Path) -> None:
         np.testing.assert_array_equal(plan_body(**body, regions=[region])[1], expected)
 
 
+def test_a_grid_without_a_place_is_the_grid_of_the_body(tmp_path: Path) -> None:
+    """Select cells one by one by a grid of the same shape, and refuse one of another shape."""
+    bar = box(tmp_path, "bar.obj", [3.0, 0.0, 0.0], [7.0, 2.0, 2.0])
+    numbers = np.random.default_rng(0).integers(0, 3, (4, 2, 2))
+    np.savez(tmp_path / "grid.npz", cells=numbers)
+    region = {"grid": str(tmp_path / "grid.npz"), "material": "stiff", "value": 2}
+    body = {"type": "model", "file": bar, "material": "soft", "regions": [region]}
+    np.testing.assert_array_equal(plan_body(**body, resolution=4)[1], numbers == 2)
+    with pytest.raises(SceneError, match=r"no origin and cell_size .* \[4, 2, 2\] .* \[8, 4, 4\]"):
+        plan_body(**body, resolution=8)
+
+
 def test_later_regions_win(tmp_path: Path) -> None:
     """Let regions overlap; materials that no cell is left of are none of the body's."""
     bar = box(tmp_path, "bar.obj", [0.0, 0.0, 0.0], [4.0, 2.0, 2.0])

@@ -31,6 +31,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from .errors import SceneError
+
 # Coordinates and lengths beyond this [m], lengths below this [m] and other magnitudes beyond this are typing errors.
 MAX_LENGTH = 1e5
 MIN_LENGTH = 1e-6
@@ -341,6 +343,8 @@ class VoxelsBody(Body):
         """Return the occupied cells, bool [x, y, z]; the lowest corner of the grid, [3], m; the edge of a cell, m."""
         if self.file is not None:
             numbers, origin, own = _read_grid(self.file)
+            own = DEFAULT_CELL_SIZE if own is None else own
+            origin = -np.array(numbers.shape) * own / 2 if origin is None else origin
             scale = 1.0 if self.cell_size is None else self.cell_size / own
             return numbers != 0, scale * origin, scale * own
         cells = self._drawing() != "."
@@ -360,17 +364,19 @@ class VoxelsBody(Body):
         return np.ascontiguousarray(drawn.transpose(2, 0, 1))
 
 
-def _read_grid(file: Path) -> tuple[np.ndarray, np.ndarray, float]:
-    """Read the cells [x, y, z], 0 where empty, the origin [3] and the cell size of an .npz file."""
+def _read_grid(file: Path) -> tuple[np.ndarray, np.ndarray | None, float | None]:
+    """Read the cells [x, y, z], 0 where empty, and what there is of origin [3] and cell size in an .npz file."""
     try:
         with np.load(file, allow_pickle=False) as data:
             cells = data["cells"]
-            own = float(data["cell_size"]) if "cell_size" in data else DEFAULT_CELL_SIZE
-            origin = data["origin"].astype(float) if "origin" in data else -np.array(cells.shape) * own / 2
+            own = float(data["cell_size"]) if "cell_size" in data else None
+            origin = data["origin"].astype(float) if "origin" in data else None
         if cells.ndim != 3 or not (cells != 0).any():
             raise ValueError(f"cells must be [x, y, z] with one of them occupied, not {list(cells.shape)}")
-        if not MIN_LENGTH <= own <= MAX_LENGTH or origin.shape != (3,) or not np.abs(origin).max() <= MAX_LENGTH:
-            raise ValueError(f"origin and cell_size must be lengths in m, not {origin.tolist()} and {own}")
+        if own is not None and not MIN_LENGTH <= own <= MAX_LENGTH:
+            raise ValueError(f"cell_size must be a length in m, not {own}")
+        if origin is not None and not (origin.shape == (3,) and np.abs(origin).max() <= MAX_LENGTH):
+            raise ValueError(f"origin must be a point in m, not {origin.tolist()}")
     # NumPy raises whatever its parsing happens to trip over; all of it means that the file is broken.
     except Exception as error:
         what = {"file": str(file), "why": str(error) or type(error).__name__}
@@ -400,8 +406,8 @@ class ModelRegion(Region):
     )
     grid: Path | None = Field(
         None,
-        description="an .npz file, relative to the scene file: cells [x, y, z], origin and cell_size in m, as of a "
-        "body of voxels in the same place: the cubes whose centres are in its cells that are not 0",
+        description="an .npz file, relative to the scene file: the cubes whose centres are in its cells [x, y, z] that "
+        "are not 0, with origin and cell_size in m in the body's frame; without these it is the body's grid",
     )
     value: int | None = Field(None, strict=True, ge=1, description="of a grid, only cells with this number")
 
@@ -421,10 +427,25 @@ class ModelRegion(Region):
         return self
 
     def grid_cells(self, shape: tuple[int, ...], origin: np.ndarray, cell_size: float) -> np.ndarray:
-        """Return which cells of a grid are in this region's grid, bool [shape]; origin [3] and cell size in m."""
+        """Return which cells of a body's grid are in this region's grid, bool [nx, ny, nz].
+
+        Args:
+            shape: of the body's grid, (nx, ny, nz).
+            origin: its lowest corner, [3], m.
+            cell_size: edge of its cells, m.
+
+        Raises:
+            SceneError: the file does not say where its cells are, and they are not those of the body's grid.
+        """
         assert self.grid is not None
         numbers, own_origin, own_size = _read_grid(self.grid)
-        selected = np.pad(numbers != 0 if self.value is None else numbers == self.value, 1)
+        selected = numbers != 0 if self.value is None else numbers == self.value
+        if own_origin is None or own_size is None:
+            if numbers.shape != shape:
+                whose = f"{list(numbers.shape)} of them, and the body's grid has {list(shape)}"
+                raise SceneError(f"{self.grid}: has no origin and cell_size to say where its cells are: {whose}")
+            return selected
+        selected = np.pad(selected, 1)
         # The cell that has each centre, along each axis; those beyond the grid are in the empty layer around it.
         places = [
             np.floor((low + (np.arange(count) + 0.5) * cell_size - own_low) / own_size).clip(-1, own_count).astype(int)
