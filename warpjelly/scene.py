@@ -373,10 +373,10 @@ def _read_grid(file: Path) -> tuple[np.ndarray, np.ndarray | None, float | None]
             origin = data["origin"].astype(float) if "origin" in data else None
         if cells.ndim != 3 or not (cells != 0).any():
             raise ValueError(f"cells must be [x, y, z] with one of them occupied, not {list(cells.shape)}")
-        if own is not None and not MIN_LENGTH <= own <= MAX_LENGTH:
-            raise ValueError(f"cell_size must be a length in m, not {own}")
-        if origin is not None and not (origin.shape == (3,) and np.abs(origin).max() <= MAX_LENGTH):
-            raise ValueError(f"origin must be a point in m, not {origin.tolist()}")
+        sized = own is None or MIN_LENGTH <= own <= MAX_LENGTH
+        if not sized or (origin is not None and not (origin.shape == (3,) and np.abs(origin).max() <= MAX_LENGTH)):
+            given = "none" if origin is None else origin.tolist()
+            raise ValueError(f"origin and cell_size must be lengths in m, not {given} and {own or 'none'}")
     # NumPy raises whatever its parsing happens to trip over; all of it means that the file is broken.
     except Exception as error:
         what = {"file": str(file), "why": str(error) or type(error).__name__}
