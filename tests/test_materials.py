@@ -228,6 +228,28 @@ def test_the_same_model_selects_every_cell(tmp_path: Path) -> None:
         assert (names, materials) == (["stiff"], None)
 
 
+@pytest.mark.parametrize("kind", ["objects", "materials", "groups"])
+@pytest.mark.parametrize("size", [{}, {"scale": 0.3}, {"fit": 7.0}])
+def test_a_part_of_the_model_selects_the_cells_inside(tmp_path: Path, kind: str, size: dict[str, float]) -> None:
+    """Name the bone in a model of two shells, one in the other: its cells are those whose centres are inside."""
+    words = {"objects": "o", "materials": "usemtl", "groups": "g"}
+    text = ""
+    for number, (name, low, high) in enumerate((("flesh", (0, 0, 0), (8, 4, 4)), ("bone", (1, 1, 1), (6, 3, 3)))):
+        shell = trimesh.creation.box(bounds=[low, high])
+        text += f"{words[kind]} {name}\n"
+        text += "".join(f"v {x} {y} {z}\n" for x, y, z in shell.vertices)
+        text += "".join(f"f {a} {b} {c}\n" for a, b, c in shell.faces + 1 + 8 * number)
+    (tmp_path / "creature.obj").write_text(text)
+    body = {"type": "model", "file": str(tmp_path / "creature.obj"), "resolution": 8, "material": "soft", **size}
+    names, materials, cells = plan_body(**body, regions=[{"part": "bone", "material": "stiff"}])
+    assert cells.all() and names == ["soft", "stiff"]
+    expected = np.zeros((8, 4, 4), int)
+    expected[1:6, 1:3, 1:3] = 1
+    np.testing.assert_array_equal(materials, expected)
+    with pytest.raises(SceneError, match=r"creature.obj: no part of the model is called 'tail'.*bone"):
+        plan_body(**body, regions=[{"part": "tail", "material": "stiff"}])
+
+
 def test_thin_parts_of_a_region_are_kept_where_those_of_the_body_are(tmp_path: Path) -> None:
     """Put a rod thinner than a cell, through no centre, into a bar: without ``keep_thin_parts`` it has no cell."""
     bar, rod = (
@@ -322,7 +344,8 @@ MODEL = {"type": "model", "material": "soft", "file": "bar.obj", "resolution": 4
             [{"material": "stiff", "symbol": "o"}],
             ["bodies.voxels_0.regions.0: has no jelly cube of the body"],
         ),
-        (MODEL, [{"material": "stiff"}], ["bodies.0.regions.0: give file or grid"]),
+        (MODEL, [{"material": "stiff"}], ["bodies.0.regions.0: give file or part or grid"]),
+        (MODEL, [{"material": "stiff", "file": "bar.obj", "part": "a"}], ["regions.0: give file or part or grid"]),
         (MODEL, [{"material": "stiff", "file": "no.obj"}], ["bodies.0.regions.0.file", "no such file"]),
         (MODEL, [{"material": "stiff", "file": "bar.obj", "prim": "/a"}], ["regions.0.prim", "only USD files"]),
         (MODEL, [{"material": "stiff", "file": "bar.obj", "value": 2}], ["regions.0.value", "goes with grid alone"]),

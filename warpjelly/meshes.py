@@ -65,6 +65,10 @@ class LoadedModel:
         mesh.vertices *= factor
         return replace(self, mesh=mesh, drawing=drawing)
 
+    def part(self, name: str) -> trimesh.Trimesh:
+        """Return the mesh of the triangles of ``region`` alone."""
+        return trimesh.Trimesh(self.mesh.vertices, self.mesh.faces[self.region(name)], process=False)
+
     def region(self, name: str) -> np.ndarray:
         """Return the triangles of the mesh that belong to an object, group, node, prim or material, int64 [count].
 

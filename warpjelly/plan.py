@@ -270,7 +270,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     regions = [
         region.grid_cells(grid.cells.shape, grid.origin, grid.cell_size)
         if region.grid is not None
-        else _cells_in_model(region, body, grid, scale, up_axis)
+        else _cells_in_mesh(region, body, model, scale, grid, up_axis)
         for region in body.regions
     ]
     # By the divergence theorem.
@@ -278,14 +278,17 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     return VoxelizedModel(grid, bool(mesh.is_watertight), model, regions, volume, notes)
 
 
-def _cells_in_model(region: ModelRegion, body: ModelBody, grid: VoxelGrid, scale: float, up_axis: str) -> np.ndarray:
-    """Return the cells of a body's grid whose centres are inside the model of a region, bool [nx, ny, nz].
+def _cells_in_mesh(
+    region: ModelRegion, body: ModelBody, model: LoadedModel, scale: float, grid: VoxelGrid, up_axis: str
+) -> np.ndarray:
+    """Return the cells of a body's grid whose centres are inside a part of its model or another one, [nx, ny, nz].
 
     Args:
-        region: names the model, which is in the units of the body's.
-        body: has the grid.
-        grid: in metres.
-        scale: metres per such unit.
+        region: names the part, or the other model, which is in the units of the body's.
+        body: what it is a region of.
+        model: that of the body, in metres.
+        scale: metres per unit.
+        grid: of the body, in metres.
         up_axis: as for ``voxelize_model``.
 
     Raises:
@@ -294,17 +297,20 @@ def _cells_in_model(region: ModelRegion, body: ModelBody, grid: VoxelGrid, scale
     from .meshes import load_model
     from .voxelize import MAX_CELLS, voxelize_on_grid
 
-    assert region.file is not None
-    mesh = load_model(region.file, up_axis=up_axis, prim=region.prim).scaled(scale).mesh
+    if region.file is None:
+        what, mesh = f"part '{region.part}' of {body.file}", model.part(str(region.part))
+    else:
+        what = str(region.file)
+        mesh = load_model(region.file, up_axis=up_axis, prim=region.prim).scaled(scale).mesh
     corners = np.concatenate([mesh.bounds, [grid.origin, grid.origin + np.array(grid.cells.shape) * grid.cell_size]])
     if (cells := np.ptp(corners, axis=0).max() / grid.cell_size) > MAX_CELLS:
         raise SceneError(
-            f"{region.file}: with bodies.{body.name} the model is {cells:,.0f} of its cells long, and at most "
+            f"{what}: with bodies.{body.name} the model is {cells:,.0f} of its cells long, and at most "
             f"{MAX_CELLS:,} can be searched: is it in the same units?"
         )
     inside, notes = voxelize_on_grid(mesh, grid, keep_thin_parts=body.keep_thin_parts)
     for note in notes:
-        log.warning("%s: %s", region.file, note)
+        log.warning("%s: %s", what, note)
     return inside
 
 

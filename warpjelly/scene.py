@@ -393,9 +393,9 @@ def _existing(file: Path, info: ValidationInfo) -> Path:
 
 
 class ModelRegion(Region):
-    """Cubes of a model by another model, or by a grid."""
+    """Cubes of a model by another model, a part of the model itself, or a grid."""
 
-    selectors = ("file", "grid")
+    selectors = ("file", "part", "grid")
     file: Path | None = Field(
         None,
         description="another model, in the frame and the units of the body's, relative to the scene file: the cubes "
@@ -403,6 +403,11 @@ class ModelRegion(Region):
     )
     prim: str | None = Field(
         None, description="of a USD file, the prim whose meshes are read; the default prim unless given"
+    )
+    part: str | None = Field(
+        None,
+        description="name of an object, group, node, prim or material of the body's own file: the cubes whose centres "
+        "are inside its faces",
     )
     grid: Path | None = Field(
         None,
