@@ -51,7 +51,7 @@ class Grid:
     first: wp.array(dtype=wp.int32)  # [vertex_count] its first particle
     material_count: int
     materials: wp.array3d(dtype=wp.uint8)  # [nx, ny, nz] material of each jelly cube; empty where there is one
-    mixed: wp.array(dtype=wp.uint8)  # [vertex_count] whether cells around differ in material; empty as well
+    alike: wp.array(dtype=wp.uint8)  # [vertex_count] patterns, but 0 where cells around differ in material
 
 
 @wp.struct
@@ -127,10 +127,7 @@ def corner_particle(grid: Grid, place: int, number: int):
 @wp.func
 def is_inner(grid: Grid, place: int):
     """Say whether a vertex, if there is one at the place, has all 8 cells around it, of one material."""
-    inner = place >= 0 and int(grid.patterns[wp.max(place, 0)]) == FULL
-    if inner and grid.mixed.shape[0] > 0:
-        inner = int(grid.mixed[place]) == 0
-    return inner
+    return place >= 0 and int(grid.alike[wp.max(place, 0)]) == FULL
 
 
 @wp.func
@@ -206,7 +203,10 @@ def find_patterns(
     # In:
     counts: wp.array(dtype=wp.uint8),
 ):
-    """Overwrite the patterns of a row of vertices, and their first particles by how many they have ``counts`` [256]."""
+    """Overwrite the patterns of a row of vertices, and their first particles by how many they have ``counts`` [256].
+
+    Where there is one material, ``alike`` is the array of patterns.
+    """
     x, y = wp.tid()
     start = grid.row_start[x, y] - grid.row_low[x, y]
     for z in range(grid.row_low[x, y], grid.row_high[x, y]):
@@ -215,10 +215,10 @@ def find_patterns(
             pattern |= occupied(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2) << number
         grid.patterns[start + z] = wp.uint8(pattern)
         grid.first[start + z] = wp.int32(counts[pattern])
-        if grid.mixed.shape[0] > 0:
+        if grid.materials.shape[0] > 0:
             found = count_materials(grid, x, y, z, pattern)
-            most = wp.max(found)
-            grid.mixed[start + z] = wp.where(most < wp.dot(found, vec8i(1)), wp.uint8(1), wp.uint8(0))
+            uniform = wp.max(found) == wp.dot(found, vec8i(1))
+            grid.alike[start + z] = wp.uint8(wp.where(uniform, pattern, 0))
 
 
 @wp.kernel

@@ -275,11 +275,11 @@ def _number_particles(cells: np.ndarray, refinement: int, materials: np.ndarray 
     grid.row_low, grid.row_high = array(low, wp.int32), array(low + lengths, wp.int32)
     grid.patterns = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
     grid.first = wp.empty(vertex_count, dtype=wp.int32, device="cpu")
-    grid.material_count = 1
+    grid.material_count, grid.alike = 1, grid.patterns
     if materials is not None:
         grid.material_count = int(materials[cells].max()) + 1
         grid.materials = array(materials, wp.uint8)
-        grid.mixed = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
+        grid.alike = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
     _launch(find_patterns, lengths.shape, [grid, array(counts, wp.uint8)], [])
     # From how many particles each vertex has to how many there are before it.
     first = grid.first.numpy()
