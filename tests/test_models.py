@@ -10,12 +10,15 @@ MODELS = Path(__file__).parents[1] / "scenes" / "models"
 EXTENTS = {
     "tree": ([-1 / 3, 0.0, -1 / 3], [1 / 3, 1.0, 1 / 3]),
     "coupler": ([-0.25, -0.3, -0.25], [0.25, 0.3, 0.25]),
+    "creature": ([-0.379493, 0.0, -0.584952], [0.379493, 1.0, 0.482]),
 }
 
 
 def load(name: str) -> trimesh.Trimesh:
-    """Read a model as it is written, without merging or repair."""
-    return trimesh.load_mesh(MODELS / f"{name}.obj", process=False)
+    """Read a model as it is written, without merging, repair or a split by materials."""
+    lines = [line.split() for line in (MODELS / f"{name}.obj").read_text().splitlines()]
+    vertices, faces = ([line[1:] for line in lines if line[0] == key] for key in "vf")
+    return trimesh.Trimesh(np.array(vertices, float), np.array(faces, int) - 1, process=False)
 
 
 def winding_numbers(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
@@ -34,7 +37,7 @@ def test_models_are_what_the_script_makes(tmp_path: Path) -> None:
     """Make the committed models again, byte for byte."""
     runpy.run_path(str(MODELS / "make_models.py"))["write_models"](tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
-        path.name: path.read_bytes() for path in MODELS.glob("*.obj")
+        path.name: path.read_bytes() for path in MODELS.iterdir() if path.suffix in (".obj", ".mtl")
     }
 
 
@@ -93,3 +96,36 @@ def test_coupler_survives_20_cells() -> None:
         runs = np.diff(np.flatnonzero(np.diff(inside)), prepend=-1, append=len(inside) - 1)
         assert runs.min() >= 2
         assert len(runs) >= 5, "the slit winds at least twice around the axis"
+
+
+def test_creature_stands_on_four_feet() -> None:
+    """Find four flat feet below the creature, and its middle above them."""
+    mesh = load("creature")
+    centers = mesh.triangles_center[mesh.triangles[:, :, 1].max(axis=1) == 0.0]
+    quarters = {(x > 0, z > mesh.center_mass[2]) for x, _, z in centers}
+    assert len(quarters) == 4
+    assert centers[:, 2].min() < mesh.center_mass[2] < centers[:, 2].max()
+    assert abs(mesh.center_mass[0]) < 1e-3
+
+
+def test_creature_has_a_material_on_every_part() -> None:
+    """Find triangles of each material where its part is, and a colour for it."""
+    obj, mtl = (
+        [line.split() for line in (MODELS / f"creature.{end}").read_text().splitlines()] for end in ("obj", "mtl")
+    )
+    colored = [line[1] for line in mtl if line[0] == "newmtl"]
+    used: dict[str, set[int]] = {}
+    for key, *values in obj:
+        if key == "usemtl":
+            used[values[0]] = set()
+        elif key == "f":
+            next(reversed(used.values())).update(int(value) - 1 for value in values)
+    assert list(used) == colored
+    bounds = {name: load("creature").vertices[sorted(corners)] for name, corners in used.items()}
+    low = {name: points.min(axis=0) for name, points in bounds.items()}
+    high = {name: points.max(axis=0) for name, points in bounds.items()}
+    assert high["hoof"][1] < 0.15
+    assert low["horn"][1] > 0.8
+    assert low["eye"][2] > 0.25
+    assert low["pupil"][2] > low["eye"][2]
+    assert low["nose"][2] > low["pupil"][2]

@@ -17,14 +17,57 @@ TREE_TRUNK = (2, 0, 12)  # width, bottom, top [cells]; it carries the crown and 
 TREE_CROWN = ((8, 3, 5), (4, 5, 6), (6, 6, 8), (4, 8, 10))  # the same, from below
 
 # At 20 cells along the length a cell is 0.03 m. The wall is four cells thick, and the slit and the beam
-# between its turns both exceed two cells, so that no turn is cut through and none touches the next.
+# between its turns both exceed two cells, so that no turn is cut through and none touches the next. At 8 cells the slit
+# is narrower than one; turned like this it still leaves the coupler in one piece there.
 COUPLER_LENGTH = 0.6  # [m]
 COUPLER_RADIUS = 0.25  # [m]
 COUPLER_BORE = 0.13  # radius [m]
 COUPLER_SLIT = 0.066  # height of the slit along the axis [m]
 COUPLER_PITCH = 0.135  # [m]
 COUPLER_TURNS = 2.5
+COUPLER_START = 30.0  # where the slit starts around the axis [degrees]; a whole number of segments
 COUPLER_SEGMENTS = 48  # straight edges per full circle
+
+# The creature is made of lumps: (one end, other end, radius at each, how far it blends with those before) [m]. What is
+# off the middle is there on both sides. At 24 cells no lump is thinner than two of them.
+Point = tuple[float, float, float]
+Lump = tuple[Point, Point, float, float, float]
+CREATURE_LUMPS: tuple[Lump, ...] = (
+    ((0.0, 0.44, -0.16), (0.0, 0.45, 0.06), 0.21, 0.20, 0.1),  # rump to chest
+    ((0.0, 0.40, -0.06), (0.0, 0.40, -0.02), 0.22, 0.22, 0.1),  # belly
+    ((0.0, 0.48, 0.08), (0.0, 0.64, 0.18), 0.13, 0.14, 0.1),  # neck
+    ((0.0, 0.70, 0.21), (0.0, 0.69, 0.22), 0.185, 0.185, 0.08),  # head
+    ((-0.035, 0.635, 0.36), (0.035, 0.635, 0.36), 0.095, 0.095, 0.1),  # snout
+    ((0.12, 0.36, 0.10), (0.14, 0.08, 0.13), 0.1, 0.075, 0.06),  # fore leg
+    ((0.13, 0.36, -0.22), (0.15, 0.08, -0.22), 0.12, 0.075, 0.06),  # hind leg
+    ((0.10, 0.82, 0.17), (0.17, 0.90, 0.12), 0.055, 0.065, 0.05),  # ear
+    ((0.17, 0.90, 0.12), (0.32, 0.80, 0.09), 0.065, 0.06, 0.04),  # its tip, which droops
+    ((0.0, 0.50, -0.30), (0.0, 0.52, -0.44), 0.085, 0.06, 0.08),  # tail
+    ((0.0, 0.52, -0.44), (0.0, 0.66, -0.50), 0.06, 0.055, 0.05),
+    ((0.0, 0.68, -0.50), (0.0, 0.69, -0.50), 0.085, 0.085, 0.03),  # its tuft
+)
+CREATURE_BOUNDS = (-0.5, -0.15, -0.7, 0.5, 1.1, 0.6)  # lowest and highest corner around the skin [m]
+CREATURE_EDGE = 0.036  # of the triangles of the skin [m]
+# What sticks out of the skin and has a colour of its own: (one end, other end, radius at each) [m].
+CREATURE_BALLS = {
+    "eye": (((0.095, 0.755, 0.335), (0.095, 0.755, 0.335), 0.072, 0.072),),
+    "pupil": (((0.108, 0.765, 0.367), (0.108, 0.765, 0.367), 0.046, 0.046),),
+    "nose": (((0.0, 0.675, 0.44), (0.0, 0.675, 0.44), 0.042, 0.042),),
+    "hoof": (
+        ((0.14, 0.03, 0.145), (0.14, 0.03, 0.145), 0.098, 0.098),
+        ((0.15, 0.03, -0.205), (0.15, 0.03, -0.205), 0.098, 0.098),
+    ),
+    "horn": (((0.0, 0.84, 0.27), (0.0, 0.965, 0.33), 0.068, 0.035),),
+}
+CREATURE_SEGMENTS = 20  # straight edges per full circle of these
+CREATURE_COLORS: dict[str, Point] = {  # linear
+    "skin": (0.11, 0.48, 0.39),
+    "eye": (0.92, 0.91, 0.83),
+    "pupil": (0.007, 0.006, 0.014),
+    "nose": (0.85, 0.17, 0.26),
+    "hoof": (0.09, 0.06, 0.11),
+    "horn": (0.95, 0.65, 0.17),
+}
 
 
 def tree() -> Manifold:
@@ -53,27 +96,93 @@ def coupler() -> Manifold:
     section = CrossSection.square([outer - inner, COUPLER_SLIT]).translate([inner, -COUPLER_SLIT / 2])
     steps = round(COUPLER_TURNS * COUPLER_SEGMENTS)
     slit = Manifold.extrude(section, COUPLER_TURNS, n_divisions=steps - 1).warp(wind)
-    return (tube - bore - slit).rotate([-90, 0, 0])
+    return (tube - bore - slit).rotate([-90, 0, 0]).rotate([0, COUPLER_START, 0])
 
 
-def obj_lines(solid: Manifold) -> Iterator[str]:
-    """Yield the lines of an OBJ file in an order that depends on the geometry alone."""
-    mesh = solid.to_mesh64()
+def creature() -> dict[str, Manifold]:
+    """Return the parts of a long-eared creature, one metre tall, on four legs at y = 0; it looks along z."""
+    lumps = [lump for given in CREATURE_LUMPS for lump in both_sides(given)]
+    skin = Manifold.level_set(lambda x, y, z: -blended_distance(lumps, x, y, z), CREATURE_BOUNDS, CREATURE_EDGE)
+    parts = {"skin": skin}
+    for name, balls in CREATURE_BALLS.items():
+        hulls = [
+            Manifold.batch_hull(
+                [
+                    Manifold.sphere(radius, CREATURE_SEGMENTS).translate(center)
+                    for center, radius in ((start, first), (end, last))
+                ]
+            )
+            for given in balls
+            for start, end, first, last, _ in both_sides((*given, 0.0))
+        ]
+        parts[name] = Manifold.batch_boolean(hulls, OpType.Add)
+    return {name: part.trim_by_plane((0.0, 1.0, 0.0), 0.0) for name, part in parts.items()}
+
+
+def both_sides(lump: Lump) -> list[Lump]:
+    """Return a lump and, if it is off the middle, its mirror image."""
+    (start_x, *start), (end_x, *end), *rest = lump
+    return [lump] if start_x == -end_x else [lump, ((-start_x, *start), (-end_x, *end), *rest)]
+
+
+def blended_distance(lumps: list[Lump], x: float, y: float, z: float) -> float:
+    """Return about how far a point is outside of lumps that run into each other [m].
+
+    Only what every machine rounds alike goes into it, so that the model is the same everywhere.
+    """
+    distance = math.inf
+    for (ax, ay, az), (bx, by, bz), first, last, blend in lumps:
+        dx, dy, dz, px, py, pz = bx - ax, by - ay, bz - az, x - ax, y - ay, z - az
+        along = min(1.0, max(0.0, (px * dx + py * dy + pz * dz) / (dx * dx + dy * dy + dz * dz)))
+        px, py, pz = px - along * dx, py - along * dy, pz - along * dz
+        other = math.sqrt(px * px + py * py + pz * pz) - first - along * (last - first)
+        overlap = max(0.0, blend - abs(distance - other))
+        distance = min(distance, other) - overlap * overlap / (4 * blend)
+    return distance
+
+
+def obj_lines(parts: dict[str, Manifold], library: str) -> Iterator[str]:
+    """Yield the lines of an OBJ file of the union of parts, in an order that depends on the geometry alone.
+
+    Args:
+        parts: the first one is the body, and of a single one nothing but its shape is written.
+        library: the MTL file with a material for each part.
+    """
+    names = {}
+    for name, part in parts.items():
+        parts[name] = part.as_original()
+        names[parts[name].original_id()] = name
+    mesh = Manifold.batch_boolean(list(parts.values()), OpType.Add).to_mesh64()
     points, indices = np.unique(np.round(mesh.vert_properties[:, :3], 6) + 0.0, axis=0, return_inverse=True)
     faces = indices.reshape(-1)[mesh.tri_verts]
     first = faces.argmin(axis=1)
-    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1)
-    faces = faces[np.lexsort(faces.T[::-1])] + 1
+    faces = np.take_along_axis(faces, (first[:, None] + np.arange(3)) % 3, axis=1) + 1
+    owners = np.repeat(mesh.run_original_id, np.diff(mesh.run_index) // 3)
     yield "# Made by scenes/models/make_models.py; change that script, not this file. Metres, y up."
+    if len(parts) > 1:
+        yield f"mtllib {library}"
     yield from (f"v {x:.6f} {y:.6f} {z:.6f}" for x, y, z in points)
-    yield from (f"f {a} {b} {c}" for a, b, c in faces)
+    for owner, name in names.items():
+        if len(parts) > 1:
+            yield from (f"g {name}", f"usemtl {name}")
+        part_faces = faces[owners == owner]
+        yield from (f"f {a} {b} {c}" for a, b, c in part_faces[np.lexsort(part_faces.T[::-1])])
+
+
+def mtl_lines(colors: dict[str, Point]) -> Iterator[str]:
+    """Yield the lines of an MTL file."""
+    yield "# Made by scenes/models/make_models.py; change that script, not this file."
+    for name, color in colors.items():
+        yield from (f"newmtl {name}", "Kd {:.3f} {:.3f} {:.3f}".format(*color))
 
 
 def write_models(folder: Path) -> None:
     """Write every model into `folder`."""
-    for make in (tree, coupler):
-        text = "\n".join(obj_lines(make())) + "\n"
-        (folder / f"{make.__name__}.obj").write_bytes(text.encode("ascii"))
+    models = {"tree": {"tree": tree()}, "coupler": {"coupler": coupler()}, "creature": creature()}
+    texts = {f"{name}.obj": obj_lines(parts, f"{name}.mtl") for name, parts in models.items()}
+    texts["creature.mtl"] = mtl_lines(CREATURE_COLORS)
+    for name, lines in texts.items():
+        (folder / name).write_bytes(("\n".join(lines) + "\n").encode("ascii"))
 
 
 if __name__ == "__main__":
