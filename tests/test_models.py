@@ -10,6 +10,7 @@ MODELS = Path(__file__).parents[1] / "scenes" / "models"
 EXTENTS = {
     "tree": ([-1 / 3, 0.0, -1 / 3], [1 / 3, 1.0, 1 / 3]),
     "coupler": ([-0.25, -0.3, -0.25], [0.25, 0.3, 0.25]),
+    "skeleton": ([-0.203787, 0.005585, -0.300405], [0.203787, 0.968656, 0.399619]),
     "creature": ([-0.379493, 0.0, -0.584952], [0.379493, 1.0, 0.482]),
 }
 
@@ -19,6 +20,12 @@ def load(name: str) -> trimesh.Trimesh:
     lines = [line.split() for line in (MODELS / f"{name}.obj").read_text().splitlines()]
     vertices, faces = ([line[1:] for line in lines if line[0] == key] for key in "vf")
     return trimesh.Trimesh(np.array(vertices, float), np.array(faces, int) - 1, process=False)
+
+
+def solid(name: str) -> Manifold:
+    """Return the solid that a model bounds."""
+    mesh = load(name)
+    return Manifold(Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
 
 
 def winding_numbers(mesh: trimesh.Trimesh, points: np.ndarray) -> np.ndarray:
@@ -49,8 +56,7 @@ def test_model_is_one_closed_solid(name: str) -> None:
     assert mesh.is_winding_consistent
     assert mesh.volume > 0
     assert mesh.area_faces.min() > 0
-    solid = Manifold(Mesh64(mesh.vertices, mesh.faces.astype(np.uint64)))
-    assert len(solid.decompose()) == 1
+    assert len(solid(name).decompose()) == 1
 
 
 @pytest.mark.parametrize("name", EXTENTS)
@@ -129,3 +135,10 @@ def test_creature_has_a_material_on_every_part() -> None:
     assert low["eye"][2] > 0.25
     assert low["pupil"][2] > low["eye"][2]
     assert low["nose"][2] > low["pupil"][2]
+
+
+def test_skeleton_is_inside_of_the_creature() -> None:
+    """Leave flesh around all bones: none comes out of the skin, and they are a fifth of the volume."""
+    bones, body = solid("skeleton"), solid("creature")
+    assert (bones - body).volume() == pytest.approx(0.0, abs=1e-12)
+    assert 0.15 < bones.volume() / body.volume() < 0.25

@@ -4,7 +4,7 @@ Run as `python scenes/models/make_models.py`.
 """
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
@@ -69,6 +69,19 @@ CREATURE_COLORS: dict[str, Point] = {  # linear
     "horn": (0.95, 0.65, 0.17),
 }
 
+# Bones of the creature, to be stiff inside of it: lumps as well. They are wider than a cell at 20 cells, so that its
+# jelly cubes follow them without a gap. Ears and tail have none.
+SKELETON_LUMPS: tuple[Lump, ...] = (
+    ((0.0, 0.47, -0.23), (0.0, 0.49, 0.05), 0.06, 0.06, 0.03),  # spine
+    ((0.0, 0.49, 0.05), (0.0, 0.68, 0.2), 0.06, 0.06, 0.03),  # neck
+    ((0.0, 0.69, 0.2), (0.0, 0.67, 0.33), 0.1, 0.07, 0.03),  # skull
+    ((0.0, 0.75, 0.23), (0.0, 0.93, 0.32), 0.05, 0.04, 0.03),  # horn
+    ((0.0, 0.49, 0.05), (0.12, 0.4, 0.08), 0.06, 0.06, 0.03),  # shoulder
+    ((0.0, 0.47, -0.23), (0.13, 0.4, -0.22), 0.06, 0.06, 0.03),  # hip
+    ((0.12, 0.4, 0.08), (0.14, 0.06, 0.13), 0.06, 0.055, 0.03),  # fore leg
+    ((0.13, 0.4, -0.22), (0.15, 0.06, -0.22), 0.06, 0.055, 0.03),  # hind leg
+)
+
 
 def tree() -> Manifold:
     """Return a blocky fir, one metre tall, that stands on y = 0 around the y axis."""
@@ -101,9 +114,7 @@ def coupler() -> Manifold:
 
 def creature() -> dict[str, Manifold]:
     """Return the parts of a long-eared creature, one metre tall, on four legs at y = 0; it looks along z."""
-    lumps = [lump for given in CREATURE_LUMPS for lump in both_sides(given)]
-    skin = Manifold.level_set(lambda x, y, z: -blended_distance(lumps, x, y, z), CREATURE_BOUNDS, CREATURE_EDGE)
-    parts = {"skin": skin}
+    parts = {"skin": blend(CREATURE_LUMPS)}
     for name, balls in CREATURE_BALLS.items():
         hulls = [
             Manifold.batch_hull(
@@ -117,6 +128,17 @@ def creature() -> dict[str, Manifold]:
         ]
         parts[name] = Manifold.batch_boolean(hulls, OpType.Add)
     return {name: part.trim_by_plane((0.0, 1.0, 0.0), 0.0) for name, part in parts.items()}
+
+
+def skeleton() -> Manifold:
+    """Return the bones of the creature where they are in it."""
+    return blend(SKELETON_LUMPS)
+
+
+def blend(lumps: Iterable[Lump]) -> Manifold:
+    """Return lumps and their mirror images, run into each other."""
+    both = [lump for given in lumps for lump in both_sides(given)]
+    return Manifold.level_set(lambda x, y, z: -blended_distance(both, x, y, z), CREATURE_BOUNDS, CREATURE_EDGE)
 
 
 def both_sides(lump: Lump) -> list[Lump]:
@@ -178,7 +200,7 @@ def mtl_lines(colors: dict[str, Point]) -> Iterator[str]:
 
 def write_models(folder: Path) -> None:
     """Write every model into `folder`."""
-    models = {"tree": {"tree": tree()}, "coupler": {"coupler": coupler()}, "creature": creature()}
+    models = {make.__name__: {make.__name__: make()} for make in (tree, coupler, skeleton)} | {"creature": creature()}
     texts = {f"{name}.obj": obj_lines(parts, f"{name}.mtl") for name, parts in models.items()}
     texts["creature.mtl"] = mtl_lines(CREATURE_COLORS)
     for name, lines in texts.items():

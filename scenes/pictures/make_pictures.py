@@ -1,36 +1,68 @@
 """Make the pictures of the README: run each scene and show some of its frames side by side.
 
-python scenes/pictures/make_pictures.py
+python scenes/pictures/make_pictures.py [SCENE ...]
 """
 
+import sys
 import tempfile
 from pathlib import Path
+
+from PIL import Image
 
 import warpjelly as wj
 from warpjelly.preview import render_preview
 
 HERE = Path(__file__).parent
+SIZE = (420, 340)
+GAP = 4
 # The frames that tell a scene's story.
 FRAMES = {
     "tree_drop": [0, 25, 38, 78, 299],
     "jello_cube": [0, 30, 64, 200, 299],
     "cube_on_sphere": [0, 36, 56, 76, 130],
     "u_on_sphere": [0, 33, 45, 80, 239],
-    "coupler_drop": [0, 17, 24, 51, 119],
+    "coupler_drop": [0, 6, 13, 30, 119],
+    "creature_drop": [0, 8, 13, 24, 149],
+    "two_materials": [0, 14, 20, 28, 119],
     "three_networks": [0, 20, 30, 60, 179],
     "pile": [0, 22, 36, 60, 119],
     "falling_cloth": [0, 17, 24, 35, 149],
 }
+# The same moments of several scenes, one below the other.
+COMPARED = {"couplers": (["coupler_7", "coupler_8", "coupler_drop", "coupler_40"], [0, 4, 6, 8, 13])}
 
 
-def main() -> None:
-    """Write one PNG per scene beside this file."""
+def show(scene: str, frames: list[int], picture: Path) -> None:
+    """Run a scene and write some of its frames into a PNG."""
+    with tempfile.TemporaryDirectory() as folder:
+        wj.simulate(wj.load_scene(HERE.parent / f"{scene}.toml"), output=folder)
+        render_preview(Path(folder), picture, frames=frames, size=SIZE)
+
+
+def main(chosen: list[str]) -> None:
+    """Write the chosen pictures beside this file; all of them if none is chosen."""
     for name, frames in FRAMES.items():
-        with tempfile.TemporaryDirectory() as folder:
-            wj.simulate(wj.load_scene(HERE.parent / f"{name}.toml"), output=folder)
-            render_preview(Path(folder), HERE / f"{name}.png", frames=frames, size=(420, 340))
-        print(HERE / f"{name}.png")
+        if not chosen or name in chosen:
+            show(name, frames, HERE / f"{name}.png")
+            print(HERE / f"{name}.png")
+    for name, (scenes, frames) in COMPARED.items():
+        if not chosen or name in chosen:
+            with tempfile.TemporaryDirectory() as folder:
+                strips = [Path(folder, f"{scene}.png") for scene in scenes]
+                for scene, strip in zip(scenes, strips, strict=True):
+                    show(scene, frames, strip)
+                stack([Image.open(strip) for strip in strips]).save(HERE / f"{name}.png")
+            print(HERE / f"{name}.png")
+
+
+def stack(strips: list[Image.Image]) -> Image.Image:
+    """Return pictures of one size, one below the other."""
+    width, height = strips[0].size
+    whole = Image.new("RGB", (width, len(strips) * (height + GAP) - GAP), "white")
+    for i, strip in enumerate(strips):
+        whole.paste(strip, (0, i * (height + GAP)))
+    return whole
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
