@@ -28,8 +28,8 @@ FRAMES = {
     "pile": [0, 22, 36, 60, 119],
     "falling_cloth": [0, 17, 24, 35, 149],
 }
-# The same moments of several scenes, one below the other.
-COMPARED = {"couplers": (["coupler_7", "coupler_8", "coupler_drop", "coupler_40"], [0, 4, 6, 8, 13])}
+# The same moment of several scenes.
+COMPARED = {"couplers": (["coupler_7", "coupler_8", "coupler_drop", "coupler_40"], 13)}
 
 
 def show(scene: str, frames: list[int], picture: Path) -> None:
@@ -45,22 +45,22 @@ def main(chosen: list[str]) -> None:
         if not chosen or name in chosen:
             show(name, frames, HERE / f"{name}.png")
             print(HERE / f"{name}.png")
-    for name, (scenes, frames) in COMPARED.items():
+    for name, (scenes, frame) in COMPARED.items():
         if not chosen or name in chosen:
             with tempfile.TemporaryDirectory() as folder:
-                strips = [Path(folder, f"{scene}.png") for scene in scenes]
-                for scene, strip in zip(scenes, strips, strict=True):
-                    show(scene, frames, strip)
-                stack([Image.open(strip) for strip in strips]).save(HERE / f"{name}.png")
+                panels = [Path(folder, f"{scene}.png") for scene in scenes]
+                for scene, panel in zip(scenes, panels, strict=True):
+                    show(scene, [frame], panel)
+                side_by_side([Image.open(panel) for panel in panels]).save(HERE / f"{name}.png")
             print(HERE / f"{name}.png")
 
 
-def stack(strips: list[Image.Image]) -> Image.Image:
-    """Return pictures of one size, one below the other."""
-    width, height = strips[0].size
-    whole = Image.new("RGB", (width, len(strips) * (height + GAP) - GAP), "white")
-    for i, strip in enumerate(strips):
-        whole.paste(strip, (0, i * (height + GAP)))
+def side_by_side(panels: list[Image.Image]) -> Image.Image:
+    """Return pictures of one size beside each other."""
+    width, height = panels[0].size
+    whole = Image.new("RGB", (len(panels) * (width + GAP) - GAP, height), "white")
+    for i, panel in enumerate(panels):
+        whole.paste(panel, (i * (width + GAP), 0))
     return whole
 
 
