@@ -74,7 +74,11 @@ SWITCHED_OFF = [
     ("creature_drop", {"colliders": []}, "bounce"),
     ("creature_drop", {"materials.jelly.youngs_modulus": 5e4}, "squash"),
     ("creature_drop", {"materials.jelly.youngs_modulus": 5e4}, "rest_height"),
-    ("creature_drop", {"bodies.creature.rotation": [0.0, 50.0, 90.0]}, "rest_height"),
+    (
+        "creature_drop",
+        {"bodies.creature.rotation": [0.0, 50.0, 90.0], "bodies.creature.position": [0.0, 0.5, 0.0]},
+        "rest_height",
+    ),
     ("two_materials", {"bodies.with_bones.regions": [], "duration": 1.0}, "rest_height"),
     ("two_materials", {"bodies.with_bones.regions": [], "duration": 1.0}, "squash"),
     ("two_cubes", {"soft_contact.mode": "off"}, "displacement"),
