@@ -28,7 +28,7 @@ def find_cells(
     y = int(wp.floor(point[1]))
     z = int(wp.floor(point[2]))
     cell = wp.vec3i(x, y, z)
-    if occupied(grid, x, y, z) == 0:
+    if not occupied(grid, x, y, z):
         nearest = wp.mesh_query_point_no_sign(faces, wp.vec3f(point), reach)
         cell = face_cells[nearest.face / 2]
     cells[i] = cell

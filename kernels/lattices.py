@@ -1,7 +1,7 @@
 """Particles, springs and faces of a lattice, from its occupied cells.
 
-Vertices of the grid are in rows along z, and of each row only the part that touches cells is stored: vertex (x, y, z)
-has the place ``row_start[x, y] + z - row_low[x, y]``. There it has the pattern of the 8 cells around it (bit
+Vertices of the grid are in rows along z, and of each row only the runs that touch cells are stored: vertex (x, y, z) of
+a run has the place ``run_start + z - run_low``. There it has the pattern of the 8 cells around it (bit
 ``4 x + 2 y + z`` for the cell on the (x, y, z) side) and its first particle; a table of 256 patterns says which of the
 particles at a vertex belongs to which cell.
 
@@ -39,18 +39,19 @@ vec8i = wp.types.vector(8, wp.int32)
 
 @wp.struct
 class Grid:
-    """Occupied cells, and the particles around each vertex."""
+    """The vertices of occupied cells, and the particles at each."""
 
-    cells: wp.array3d(dtype=wp.uint8)  # [nx, ny, nz] occupied jelly cubes
-    refinement: int  # unit cells along the edge of a jelly cube
     labels: wp.array2d(dtype=wp.uint8)  # [256, 8] particle of each cell around a vertex, from 0; 255 where empty
-    row_start: wp.array2d(dtype=wp.int32)  # [rows_x, rows_y] place of the first vertex of a row that is stored
-    row_low: wp.array2d(dtype=wp.int32)  # [rows_x, rows_y] its z
-    row_high: wp.array2d(dtype=wp.int32)  # [rows_x, rows_y] z after the last
+    shape: wp.vec3i  # vertices along x, y and z
+    row_start: wp.array(dtype=wp.int32)  # [rows + 1] first run of row x shape[1] + y, and the end of the last one
+    run_row: wp.array(dtype=wp.int32)  # [run_count] row of a run of vertices
+    run_low: wp.array(dtype=wp.int32)  # [run_count] its first z
+    run_high: wp.array(dtype=wp.int32)  # [run_count] z after the last
+    run_start: wp.array(dtype=wp.int32)  # [run_count] place of its first vertex
     patterns: wp.array(dtype=wp.uint8)  # [vertex_count] occupied cells around each vertex
     first: wp.array(dtype=wp.int32)  # [vertex_count] its first particle
     material_count: int
-    materials: wp.array3d(dtype=wp.uint8)  # [nx, ny, nz] material of each jelly cube; empty where there is one
+    materials: wp.array(dtype=wp.uint8)  # [vertex_count] that of the cell above; empty where there is one
     alike: wp.array(dtype=wp.uint8)  # [vertex_count] patterns, but 0 where cells around differ in material
 
 
@@ -77,24 +78,40 @@ class Bends:
 
 
 @wp.func
-def occupied(grid: Grid, x: int, y: int, z: int):
-    """Say whether a unit cell is occupied; outside of the grid none is."""
-    n = grid.refinement
-    inside = x >= 0 and y >= 0 and z >= 0
-    inside = inside and x < n * grid.cells.shape[0] and y < n * grid.cells.shape[1] and z < n * grid.cells.shape[2]
-    filled = int(0)
-    if inside:
-        filled = int(grid.cells[x / n, y / n, z / n])
-    return filled
+def vertex(grid: Grid, x: int, y: int, z: int):
+    """Return the place of a vertex, NONE where no cell touches it."""
+    place = int(NONE)
+    if x >= 0 and y >= 0 and x < grid.shape[0] and y < grid.shape[1]:
+        # The first run that ends above z.
+        row = x * grid.shape[1] + y
+        run = grid.row_start[row]
+        last = grid.row_start[row + 1]
+        end = last
+        while run < last:
+            middle = (run + last) / 2
+            if grid.run_high[middle] > z:
+                last = middle
+            else:
+                run = middle + 1
+        if run < end and z >= grid.run_low[run]:
+            place = grid.run_start[run] + z - grid.run_low[run]
+    return place
 
 
 @wp.func
-def material(grid: Grid, x: int, y: int, z: int):
-    """Return the material of an occupied unit cell."""
-    number = int(0)
-    if grid.materials.shape[0] > 0:
-        number = int(grid.materials[x / grid.refinement, y / grid.refinement, z / grid.refinement])
-    return number
+def occupied(grid: Grid, x: int, y: int, z: int):
+    """Say whether a unit cell is occupied: it is cell 7 of its lowest vertex."""
+    place = vertex(grid, x, y, z)
+    return place >= 0 and int(grid.patterns[wp.max(place, 0)]) >= 128
+
+
+@wp.func
+def material_around(grid: Grid, x: int, y: int, z: int, number: int):
+    """Return the material of an occupied cell around a vertex: it is kept at the lowest vertex of the cell."""
+    m = int(0)
+    if grid.material_count > 1:
+        m = int(grid.materials[vertex(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2)])
+    return m
 
 
 @wp.func
@@ -103,19 +120,9 @@ def count_materials(grid: Grid, x: int, y: int, z: int, pattern: int):
     counts = vec8i()
     for number in range(8):
         if (pattern >> number) % 2 == 1:
-            m = material(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2)
+            m = material_around(grid, x, y, z, number)
             counts[m] = counts[m] + 1
     return counts
-
-
-@wp.func
-def vertex(grid: Grid, x: int, y: int, z: int):
-    """Return the place of a vertex, NONE where no cell touches it."""
-    place = int(NONE)
-    if x >= 0 and y >= 0 and x < grid.row_low.shape[0] and y < grid.row_low.shape[1]:
-        if z >= grid.row_low[x, y] and z < grid.row_high[x, y]:
-            place = grid.row_start[x, y] + z - grid.row_low[x, y]
-    return place
 
 
 @wp.func
@@ -197,28 +204,20 @@ def bends_from(grid: Grid, x: int, y: int, z: int, dx: int, dy: int, dz: int):
 
 
 @wp.kernel
-def find_patterns(
+def find_alike(
     # In and out:
     grid: Grid,
-    # In:
-    counts: wp.array(dtype=wp.uint8),
 ):
-    """Overwrite the patterns of a row of vertices, and their first particles by how many they have ``counts`` [256].
-
-    Where there is one material, ``alike`` is the array of patterns.
-    """
-    x, y = wp.tid()
-    start = grid.row_start[x, y] - grid.row_low[x, y]
-    for z in range(grid.row_low[x, y], grid.row_high[x, y]):
-        pattern = 0
-        for number in range(8):
-            pattern |= occupied(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2) << number
-        grid.patterns[start + z] = wp.uint8(pattern)
-        grid.first[start + z] = wp.int32(counts[pattern])
-        if grid.materials.shape[0] > 0:
-            found = count_materials(grid, x, y, z, pattern)
-            uniform = wp.max(found) == wp.dot(found, vec8i(1))
-            grid.alike[start + z] = wp.uint8(wp.where(uniform, pattern, 0))
+    """Overwrite ``alike`` of a run of vertices, where there are several materials."""
+    run = wp.tid()
+    x = grid.run_row[run] / grid.shape[1]
+    y = grid.run_row[run] % grid.shape[1]
+    start = grid.run_start[run] - grid.run_low[run]
+    for z in range(grid.run_low[run], grid.run_high[run]):
+        pattern = int(grid.patterns[start + z])
+        found = count_materials(grid, x, y, z, pattern)
+        uniform = wp.max(found) == wp.dot(found, vec8i(1))
+        grid.alike[start + z] = wp.uint8(wp.where(uniform, pattern, 0))
 
 
 @wp.kernel
@@ -229,16 +228,18 @@ def place_particles(
     vertices: wp.array(dtype=wp.vec3i),
     cells: wp.array2d(dtype=wp.uint8),
 ):
-    """Overwrite the grid coordinates of the particles of a row, and add the cells of each material that share each."""
-    x, y = wp.tid()
-    start = grid.row_start[x, y] - grid.row_low[x, y]
-    for z in range(grid.row_low[x, y], grid.row_high[x, y]):
+    """Overwrite the grid coordinates of the particles of a run, and add the cells of each material that share each."""
+    run = wp.tid()
+    x = grid.run_row[run] / grid.shape[1]
+    y = grid.run_row[run] % grid.shape[1]
+    start = grid.run_start[run] - grid.run_low[run]
+    for z in range(grid.run_low[run], grid.run_high[run]):
         pattern = int(grid.patterns[start + z])
         for number in range(8):
             if (pattern >> number) % 2 == 1:
                 particle = corner_particle(grid, start + z, number)
                 vertices[particle] = wp.vec3i(x, y, z)
-                m = material(grid, x - 1 + number / 4, y - 1 + number / 2 % 2, z - 1 + number % 2)
+                m = material_around(grid, x, y, z, number)
                 cells[m, particle] = cells[m, particle] + wp.uint8(1)
 
 
@@ -358,46 +359,49 @@ def find_spans(
     row_at = int(row_start)
     last = vec8i()
     span = wp.vec4i(0, 0, 0, 0)
-    for x in range(grid.row_low.shape[0]):
-        for y in range(grid.row_low.shape[1]):
-            for z in range(grid.row_low[x, y], grid.row_high[x, y]):
-                here = grid.row_start[x, y] + z - grid.row_low[x, y]
-                there = vertex(grid, x + reach * dx, y + reach * dy, z + reach * dz)
-                inner = is_inner(grid, here) and is_inner(grid, there)
-                if inner and kind == BEND:
-                    inner = is_inner(grid, vertex(grid, x + dx, y + dy, z + dz))
-                if inner and weighted and kind == STRUCTURAL:
-                    inner = is_inner(grid, vertex(grid, x - dx, y - dy, z - dz)) and (
-                        is_inner(grid, vertex(grid, x + 2 * dx, y + 2 * dy, z + 2 * dz))
-                    )
-                if inner:
-                    label = inner_label | material(grid, x, y, z) << MATERIAL_SHIFT
-                    span, at = append_spring(spans, span, at, grid.first[here], grid.first[there], label)
-                elif kind == BEND:
-                    bends = bends_from(grid, x, y, z, dx, dy, dz)
-                    for b in range(bends.count):
-                        near = count_materials(grid, x, y, z, bends.near_cells[b])
-                        far = count_materials(grid, x + dx, y + dy, z + dz, bends.far_cells[b])
+    for run in range(grid.run_row.shape[0]):
+        x = grid.run_row[run] / grid.shape[1]
+        y = grid.run_row[run] % grid.shape[1]
+        for z in range(grid.run_low[run], grid.run_high[run]):
+            here = grid.run_start[run] + z - grid.run_low[run]
+            there = vertex(grid, x + reach * dx, y + reach * dy, z + reach * dz)
+            inner = is_inner(grid, here) and is_inner(grid, there)
+            if inner and kind == BEND:
+                inner = is_inner(grid, vertex(grid, x + dx, y + dy, z + dz))
+            if inner and weighted and kind == STRUCTURAL:
+                inner = is_inner(grid, vertex(grid, x - dx, y - dy, z - dz)) and (
+                    is_inner(grid, vertex(grid, x + 2 * dx, y + 2 * dy, z + 2 * dz))
+                )
+            if inner:
+                label = inner_label
+                if grid.material_count > 1:
+                    label |= int(grid.materials[here]) << MATERIAL_SHIFT
+                span, at = append_spring(spans, span, at, grid.first[here], grid.first[there], label)
+            elif kind == BEND:
+                bends = bends_from(grid, x, y, z, dx, dy, dz)
+                for b in range(bends.count):
+                    near = count_materials(grid, x, y, z, bends.near_cells[b])
+                    far = count_materials(grid, x + dx, y + dy, z + dz, bends.far_cells[b])
+                    cells = vec8i()
+                    if weighted:
+                        cells = wp.min(near, far)
+                    row = describe(grid, kind, near + far, cells, vec8i())
+                    label, last, row_at = label_row(grid, rows, row, last, row_at)
+                    span, at = append_spring(spans, span, at, bends.start[b], bends.end[b], label)
+            else:
+                found = springs_from(grid, x, y, z, dx, dy, dz)
+                for s in range(4):
+                    if found.start[s] >= 0:
+                        around = count_materials(grid, x, y, z, found.cells[s])
                         cells = vec8i()
+                        over = vec8i()
                         if weighted:
-                            cells = wp.min(near, far)
-                        row = describe(grid, kind, near + far, cells, vec8i())
+                            cells = around
+                            if kind == STRUCTURAL:
+                                over = cells_of_bends(grid, x, y, z, dx, dy, dz, s)
+                        row = describe(grid, kind, around, cells, over)
                         label, last, row_at = label_row(grid, rows, row, last, row_at)
-                        span, at = append_spring(spans, span, at, bends.start[b], bends.end[b], label)
-                else:
-                    found = springs_from(grid, x, y, z, dx, dy, dz)
-                    for s in range(4):
-                        if found.start[s] >= 0:
-                            around = count_materials(grid, x, y, z, found.cells[s])
-                            cells = vec8i()
-                            over = vec8i()
-                            if weighted:
-                                cells = around
-                                if kind == STRUCTURAL:
-                                    over = cells_of_bends(grid, x, y, z, dx, dy, dz, s)
-                            row = describe(grid, kind, around, cells, over)
-                            label, last, row_at = label_row(grid, rows, row, last, row_at)
-                            span, at = append_spring(spans, span, at, found.start[s], found.end[s], label)
+                        span, at = append_spring(spans, span, at, found.start[s], found.end[s], label)
     counts[d] = store_span(spans, span, at) - starts[d]
     counts[kinds.shape[0] + d] = row_at - row_start
 
@@ -424,25 +428,25 @@ def find_faces(
     at = starts[direction]
     step = wp.vec3i(0, 0, 0)
     step[axis] = 2 * side - 1
-    for x in range(grid.row_low.shape[0] - 1):
-        for y in range(grid.row_low.shape[1] - 1):
-            for z in range(grid.row_low[x, y], grid.row_high[x, y]):
-                # A cell is cell 7 of its lowest vertex.
-                if int(grid.patterns[vertex(grid, x, y, z)]) >= 128:
-                    if occupied(grid, x + step[0], y + step[1], z + step[2]) == 0:
-                        if at < quads.shape[0]:
-                            quad = wp.vec4i(0, 0, 0, 0)
-                            for k in range(4):
-                                # (0, 0), (1, 0), (1, 1), (0, 1) along (u, w), or the other way round.
-                                corner = wp.vec3i(0, 0, 0)
-                                corner[axis] = side
-                                along_u = (k + 1) / 2 % 2
-                                along_w = k / 2
-                                corner[u] = wp.where(side == 1, along_u, along_w)
-                                corner[w] = wp.where(side == 1, along_w, along_u)
-                                place = vertex(grid, x + corner[0], y + corner[1], z + corner[2])
-                                number = 7 - (4 * corner[0] + 2 * corner[1] + corner[2])
-                                quad[k] = corner_particle(grid, place, number)
-                            quads[at] = quad
-                        at += 1
+    for run in range(grid.run_row.shape[0]):
+        x = grid.run_row[run] / grid.shape[1]
+        y = grid.run_row[run] % grid.shape[1]
+        for z in range(grid.run_low[run], grid.run_high[run]):
+            if occupied(grid, x, y, z):
+                if not occupied(grid, x + step[0], y + step[1], z + step[2]):
+                    if at < quads.shape[0]:
+                        quad = wp.vec4i(0, 0, 0, 0)
+                        for k in range(4):
+                            # (0, 0), (1, 0), (1, 1), (0, 1) along (u, w), or the other way round.
+                            corner = wp.vec3i(0, 0, 0)
+                            corner[axis] = side
+                            along_u = (k + 1) / 2 % 2
+                            along_w = k / 2
+                            corner[u] = wp.where(side == 1, along_u, along_w)
+                            corner[w] = wp.where(side == 1, along_w, along_u)
+                            place = vertex(grid, x + corner[0], y + corner[1], z + corner[2])
+                            number = 7 - (4 * corner[0] + 2 * corner[1] + corner[2])
+                            quad[k] = corner_particle(grid, place, number)
+                        quads[at] = quad
+                    at += 1
     counts[direction] = at - starts[direction]

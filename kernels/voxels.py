@@ -1,10 +1,12 @@
 """Triangles -> occupied cells: scan conversion, and what it leaves out.
 
 A cell's winding number is how often the surface goes round its centre: the crossings of a ray from there towards -z, +1
-where it goes out of the mesh and -1 where it goes in. Each triangle adds its crossing to one place in each column of
-cells that it covers: to the first cell whose centre lies beyond it, or to the extra place after the last cell. Sums
-along the columns then give the winding number of every cell, and the one after the last cell says whether the surface
-is closed there. Counters are bits in planes: one plane keeps them modulo 2, which is parity, and four modulo 16.
+where it goes out of the mesh and -1 where it goes in. Each triangle has one crossing in each column of cells that it
+covers, in front of the first cell whose centre lies beyond it, or after the last cell. Sorted and added up along the
+columns they give the winding number of every cell, and what is left after the last one says whether the surface is
+closed there. So nothing is stored of cells between crossings.
+
+Kernels that find a number of things per triangle are launched twice: without room they count them, then they write.
 
 Centres that lie exactly on an edge, a vertex or a face count as shifted by (e, e^2, e^3) for a vanishing e > 0, so that
 neighbouring triangles never both count a column, nor both miss it. All tests are in integers, hence exact.
@@ -18,7 +20,9 @@ wp.set_module_options({"enable_backward": False})
 SUBCELLS = 1 << 18
 # Products of three coordinates are exact in two parts, of which the low one has this many bits.
 LOW_BITS = wp.constant(wp.int64(30))
-BITS_PER_WORD = 32
+# A triangle is looked for all along a column where it is steeper than 10,000 cells in one, otherwise near its plane.
+STEEP = wp.constant(wp.float64(1e-4))
+MARGIN = wp.constant(wp.float64(1e-3))
 
 vec3l = wp.types.vector(3, wp.int64)
 
@@ -62,19 +66,74 @@ def _is_beyond(normal: vec3l, offset: vec3l):
     return beyond
 
 
+@wp.func
+def _reach(a: wp.vec3d, b: wp.vec3d, low: wp.float64, high: wp.float64):
+    """Return the least and the greatest y of an edge from x = low to high, or infinity and its negative."""
+    least = wp.float64(wp.inf)
+    most = -least
+    if wp.min(a[0], b[0]) <= high and wp.max(a[0], b[0]) >= low:
+        zero = wp.float64(0.0)
+        one = wp.float64(1.0)
+        s = zero
+        t = one
+        if a[0] != b[0]:
+            s = wp.clamp((low - a[0]) / (b[0] - a[0]), zero, one)
+            t = wp.clamp((high - a[0]) / (b[0] - a[0]), zero, one)
+        p = a[1] + s * (b[1] - a[1])
+        q = a[1] + t * (b[1] - a[1])
+        least = wp.min(p, q)
+        most = wp.max(p, q)
+    return wp.vec2d(least, most)
+
+
+@wp.func
+def _rows(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, low: wp.float64, high: wp.float64, margin: wp.float64, ny: int):
+    """Return the first row along y that a triangle may meet from x = low to high, and the one after the last.
+
+    Rows are those of cells whose middle is at most ``margin`` away.
+    """
+    p = _reach(a, b, low, high)
+    q = _reach(b, c, low, high)
+    r = _reach(c, a, low, high)
+    least = wp.min(p[0], wp.min(q[0], r[0])) - wp.float64(0.5) - margin
+    most = wp.max(p[1], wp.max(q[1], r[1])) - wp.float64(0.5) + margin
+    size = wp.float64(ny)
+    zero = wp.float64(0.0)
+    # One more on each side than the sums say, which are rounded.
+    first = int(wp.floor(wp.clamp(least, zero, size)))
+    return first, int(wp.ceil(wp.clamp(most + wp.float64(1.0), zero, size)))
+
+
+@wp.func
+def _height(normal: vec3l, a: vec3l, p: vec3l, nz: int):
+    """Return the first cell of a column beyond the plane through a, nz if none is; p is the centre of the cell at 0."""
+    # Where the plane crosses the column to a rounding, and from there on exactly.
+    rise = wp.float64(normal[0]) * wp.float64(a[0] - p[0]) + wp.float64(normal[1]) * wp.float64(a[1] - p[1])
+    crossing = (wp.float64(a[2]) + rise / wp.float64(normal[2])) / wp.float64(SUBCELLS)
+    k = wp.clamp(int(wp.ceil(crossing - wp.float64(0.5))), 0, nz)
+    while k > 0 and _is_beyond(normal, p + vec3l(wp.int64(0), wp.int64(0), wp.int64(k - 1) * wp.int64(SUBCELLS)) - a):
+        k -= 1
+    while k < nz and not _is_beyond(normal, p + vec3l(wp.int64(0), wp.int64(0), wp.int64(k) * wp.int64(SUBCELLS)) - a):
+        k += 1
+    return k
+
+
 @wp.kernel
-def add_crossings(
+def find_crossings(
     # In:
     triangles: wp.array3d(dtype=wp.int64),
     shape: wp.vec3i,
+    starts: wp.array(dtype=wp.int64),
     # Out:
-    planes: wp.array4d(dtype=wp.uint32),
+    crossings: wp.array(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
 ):
-    """Add the crossings of triangles [count, corner, xyz], in subcells, one thread per triangle.
+    """Overwrite the crossings of triangles [count, corner, xyz], in subcells, and how many each triangle has.
 
-    Counters are in the bits of planes [plane, x, y, z / 32], z from 0 to shape[2].
+    A crossing is twice its place, (x ny + y) (nz + 1) + z with z from 0 to nz, and one more where the ray goes out.
     """
     t = wp.tid()
+    counts[t] = wp.int64(0)
     a = _corner(triangles, t, 0)
     b = _corner(triangles, t, 1)
     c = _corner(triangles, t, 2)
@@ -82,13 +141,13 @@ def add_crossings(
     if normal[2] == wp.int64(0):
         return
     # Seen along z, the corners have to go round counter-clockwise. Then the surface faced down, and a ray goes out.
-    goes_out = bool(False)
+    goes_out = wp.int64(0)
     if normal[2] < wp.int64(0):
         normal = -normal
         swapped = b
         b = c
         c = swapped
-        goes_out = True
+        goes_out = wp.int64(1)
     cell = wp.int64(SUBCELLS)
     half = cell / wp.int64(2)
     # Columns whose centre lies between the least and the greatest coordinate.
@@ -96,72 +155,22 @@ def add_crossings(
     high = wp.max(a, wp.max(b, c))
     first_x = int(wp.max(wp.int64(0), (low[0] - half) / cell))
     last_x = int(wp.min(wp.int64(shape[0] - 1), (high[0] + half) / cell))
-    first_y = int(wp.max(wp.int64(0), (low[1] - half) / cell))
-    last_y = int(wp.min(wp.int64(shape[1] - 1), (high[1] + half) / cell))
+    scale = wp.float64(1.0) / wp.float64(SUBCELLS)
+    at = starts[t]
     for i in range(first_x, last_x + 1):
-        for j in range(first_y, last_y + 1):
+        x = wp.float64(i) + wp.float64(0.5)
+        first_y, after_y = _rows(
+            wp.vec3d(a) * scale, wp.vec3d(b) * scale, wp.vec3d(c) * scale, x, x, wp.float64(0.0), shape[1]
+        )
+        for j in range(first_y, after_y):
             p = vec3l(wp.int64(i) * cell + half, wp.int64(j) * cell + half, half)
             if _covers(a, b, p) and _covers(b, c, p) and _covers(c, a, p):
-                # Where the plane crosses the column to a rounding, and from there on exactly.
-                rise = wp.float64(normal[0]) * wp.float64(a[0] - p[0]) + wp.float64(normal[1]) * wp.float64(a[1] - p[1])
-                crossing = (wp.float64(a[2]) + rise / wp.float64(normal[2])) / wp.float64(SUBCELLS)
-                k = wp.clamp(int(wp.ceil(crossing - wp.float64(0.5))), 0, shape[2])
-                while k > 0 and _is_beyond(normal, vec3l(p[0], p[1], wp.int64(k - 1) * cell + half) - a):
-                    k -= 1
-                while k < shape[2] and not _is_beyond(normal, vec3l(p[0], p[1], wp.int64(k) * cell + half) - a):
-                    k += 1
-                # A carry of +1 goes on where the bit was 1, that of -1 where it was 0.
-                bit = wp.uint32(1) << wp.uint32(k % BITS_PER_WORD)
-                carries = bool(True)
-                for plane in range(planes.shape[0]):
-                    if carries:
-                        before = wp.atomic_xor(planes, plane, i, j, k / BITS_PER_WORD, bit)
-                        carries = ((before & bit) != wp.uint32(0)) == goes_out
-
-
-# Whole runs of cells at once: between crossings, far apart at fine resolutions, all cells are alike.
-@wp.func_native("""
-    auto column = cells.data + (size_t(i) * cells.shape[1] + j) * cells.shape[2];
-    if (stop > start) memset(column + start, value, stop - start);
-""")
-def _fill_run(cells: wp.array3d(dtype=wp.uint8), i: int, j: int, start: int, stop: int, value: int): ...
-
-
-@wp.kernel
-def fill_columns(
-    # In:
-    planes: wp.array4d(dtype=wp.uint32),
-    # Out:
-    cells: wp.array3d(dtype=wp.uint8),
-    open_columns: wp.array2d(dtype=wp.uint8),
-    seen: wp.array(dtype=wp.int32),
-):
-    """Overwrite which cells have a winding number that is not 0, one thread per column.
-
-    Overwrite too in which columns the surface is open, and set what winding numbers were seen, modulo seen's length.
-    """
-    i, j = wp.tid()
-    count = planes.shape[0]
-    nz = cells.shape[2]
-    winding = int(0)
-    # Where the cells begin that have this winding number.
-    start = int(0)
-    for word in range(nz / BITS_PER_WORD + 1):
-        crossed = wp.uint32(0)
-        for plane in range(count):
-            crossed |= planes[plane, i, j, word]
-        if crossed != wp.uint32(0):
-            for bit in range(BITS_PER_WORD):
-                if ((crossed >> wp.uint32(bit)) & wp.uint32(1)) != wp.uint32(0):
-                    k = word * BITS_PER_WORD + bit
-                    _fill_run(cells, i, j, start, k, wp.min(winding, 1))
-                    start = k
-                    for plane in range(count):
-                        winding += int((planes[plane, i, j, word] >> wp.uint32(bit)) & wp.uint32(1)) << plane
-                    winding = winding & ((1 << count) - 1)
-                    seen[winding] = 1
-    _fill_run(cells, i, j, start, nz, wp.min(winding, 1))
-    open_columns[i, j] = wp.uint8(wp.min(winding, 1))
+                if crossings.shape[0] > 0:
+                    place = (wp.int64(i) * wp.int64(shape[1]) + wp.int64(j)) * wp.int64(shape[2] + 1)
+                    place += wp.int64(_height(normal, a, p, shape[2]))
+                    crossings[at] = wp.int64(2) * place + goes_out
+                at += wp.int64(1)
+    counts[t] = at - starts[t]
 
 
 @wp.func
@@ -190,53 +199,104 @@ def _meets_box(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, half: wp.float64):
     return meets
 
 
+@wp.struct
+class Runs:
+    """Occupied cells as runs along z."""
+
+    shape: wp.vec3i
+    row_start: wp.array(dtype=wp.int32)  # [nx ny + 1] first run of a row, and the end of the last one
+    low: wp.array(dtype=wp.int32)  # [run_count] where a run begins
+    high: wp.array(dtype=wp.int32)  # [run_count] and ends
+
+
 @wp.func
-def _is_near(cells: wp.array3d(dtype=wp.uint8), i: int, j: int, k: int):
+def _is_near(runs: Runs, i: int, j: int, k: int):
     """Say whether a cell or one of the 26 around it is occupied."""
-    if cells[i, j, k] != wp.uint8(0):
-        return True
-    for x in range(wp.max(0, i - 1), wp.min(cells.shape[0], i + 2)):
-        for y in range(wp.max(0, j - 1), wp.min(cells.shape[1], j + 2)):
-            for z in range(wp.max(0, k - 1), wp.min(cells.shape[2], k + 2)):
-                if cells[x, y, z] != wp.uint8(0):
-                    return True
-    return False
+    near = bool(False)
+    # The row itself first: it has one most often.
+    for n in range(9):
+        x = i + (n + 4) % 9 / 3 - 1
+        y = j + (n + 4) % 3 - 1
+        if not near and x >= 0 and y >= 0 and x < runs.shape[0] and y < runs.shape[1]:
+            # The first run that ends beyond k - 1.
+            row = x * runs.shape[1] + y
+            first = runs.row_start[row]
+            last = runs.row_start[row + 1]
+            end = last
+            while first < last:
+                middle = (first + last) / 2
+                if runs.high[middle] > k - 1:
+                    last = middle
+                else:
+                    first = middle + 1
+            near = first < end and runs.low[first] <= k + 1
+    return near
+
+
+@wp.func
+def _crosses_column(a: wp.vec3d, b: wp.vec3d, c: wp.vec3d, half: wp.float64):
+    """Say whether a triangle meets the column of half edge ``half`` around the z axis; its box does."""
+    up = wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(1.0))
+    apart = _separates(wp.cross(up, b - a), a, b, c, half)
+    apart = apart or _separates(wp.cross(up, c - b), a, b, c, half)
+    return not (apart or _separates(wp.cross(up, a - c), a, b, c, half))
 
 
 @wp.kernel
 def find_thin_parts(
     # In:
-    triangles: wp.array2d(dtype=wp.vec3d),
-    cells: wp.array3d(dtype=wp.uint8),
+    triangles: wp.array3d(dtype=wp.int64),
+    runs: Runs,
     far: bool,
-    # In and out:
-    thin: wp.array(dtype=wp.uint8),
+    chosen: wp.array(dtype=wp.int64),
+    starts: wp.array(dtype=wp.int64),
     # Out:
-    found: wp.array3d(dtype=wp.uint8),
+    places: wp.array(dtype=wp.int64),
+    counts: wp.array(dtype=wp.int64),
 ):
-    """Find the cells that triangles [count, corner], in cells, pass through, one thread per triangle.
+    """Overwrite the cells that triangles [count, corner, xyz], in subcells, pass through, and how many each has.
 
-    Far: those with no occupied cell around them, whose triangles become thin. Otherwise: of thin triangles, those with
-    one. Occupy the cells found, where there is room for them.
+    Far: those with no occupied cell around them. Otherwise those with one. Only of triangles for which ``chosen`` is
+    above 0. A cell is given by its place (x ny + y) (nz + 1) + z.
     """
     t = wp.tid()
-    if not far and thin[t] == wp.uint8(0):
+    counts[t] = wp.int64(0)
+    if chosen[t] == wp.int64(0):
         return
-    a = triangles[t, 0]
-    b = triangles[t, 1]
-    c = triangles[t, 2]
+    edge_a = _corner(triangles, t, 1) - _corner(triangles, t, 0)
+    edge_b = _corner(triangles, t, 2) - _corner(triangles, t, 0)
+    normal = wp.vec3d(wp.cross(edge_a, edge_b))
+    scale = wp.float64(1.0) / wp.float64(SUBCELLS)
+    a = wp.vec3d(_corner(triangles, t, 0)) * scale
+    b = wp.vec3d(_corner(triangles, t, 1)) * scale
+    c = wp.vec3d(_corner(triangles, t, 2)) * scale
     low = wp.min(a, wp.min(b, c))
     high = wp.max(a, wp.max(b, c))
     half = wp.float64(0.5)
-    for i in range(wp.max(0, int(low[0])), wp.min(cells.shape[0], int(high[0]) + 1)):
-        for j in range(wp.max(0, int(low[1])), wp.min(cells.shape[1], int(high[1]) + 1)):
-            for k in range(wp.max(0, int(low[2])), wp.min(cells.shape[2], int(high[2]) + 1)):
-                if _is_near(cells, i, j, k) != far:
-                    center = wp.vec3d(wp.float64(i) + half, wp.float64(j) + half, wp.float64(k) + half)
-                    if _meets_box(a - center, b - center, c - center, half):
-                        thin[t] = wp.uint8(1)
-                        if found.shape[0] > 0:
-                            found[i, j, k] = wp.uint8(1)
+    slope = wp.abs(normal[0]) + wp.abs(normal[1])
+    at = starts[t]
+    for i in range(wp.max(0, int(low[0])), wp.min(runs.shape[0], int(high[0]) + 1)):
+        first_y, after_y = _rows(a, b, c, wp.float64(i), wp.float64(i + 1), half + MARGIN, runs.shape[1])
+        for j in range(wp.max(first_y, int(low[1])), wp.min(after_y, int(high[1]) + 1)):
+            column = wp.vec3d(wp.float64(i) + half, wp.float64(j) + half, wp.float64(0.0))
+            if _crosses_column(a - column, b - column, c - column, half):
+                bottom = low[2]
+                top = high[2]
+                if wp.abs(normal[2]) > STEEP * slope:
+                    rise = normal[0] * (a[0] - column[0]) + normal[1] * (a[1] - column[1])
+                    middle = a[2] + rise / normal[2]
+                    reach = half * slope / wp.abs(normal[2]) + MARGIN
+                    bottom = wp.max(bottom, middle - reach)
+                    top = wp.min(top, middle + reach)
+                for k in range(wp.max(0, int(bottom)), wp.min(runs.shape[2], int(top) + 1)):
+                    if _is_near(runs, i, j, k) != far:
+                        center = column + wp.vec3d(wp.float64(0.0), wp.float64(0.0), wp.float64(k) + half)
+                        if _meets_box(a - center, b - center, c - center, half):
+                            if places.shape[0] > 0:
+                                row = wp.int64(i) * wp.int64(runs.shape[1]) + wp.int64(j)
+                                places[at] = row * wp.int64(runs.shape[2] + 1) + wp.int64(k)
+                            at += wp.int64(1)
+    counts[t] = at - starts[t]
 
 
 @wp.func
@@ -251,31 +311,29 @@ def _root(parent: wp.array(dtype=wp.int32), run: int):
 @wp.kernel
 def join_runs(
     # In:
-    row_start: wp.array2d(dtype=wp.int32),
-    low: wp.array(dtype=wp.int32),
-    high: wp.array(dtype=wp.int32),
+    runs: Runs,
     # In and out:
     parent: wp.array(dtype=wp.int32),
 ):
-    """Join runs of occupied cells, from low to high along z, that share faces with those of neighbouring rows.
+    """Join runs of occupied cells that share faces with those of neighbouring rows.
 
-    For one thread, on the CPU: it walks the rows once. ``row_start`` [nx, ny + 1] has the first run of each row and the
-    end of the last one in y; ``parent`` begins as the numbers of the runs and ends with the first run of each piece.
+    For one thread, on the CPU: it walks the rows once. ``parent`` begins as the numbers of the runs and ends with the
+    first run of each piece.
     """
-    for x in range(row_start.shape[0]):
-        for y in range(row_start.shape[1] - 1):
+    for x in range(runs.shape[0]):
+        for y in range(runs.shape[1]):
+            row = x * runs.shape[1] + y
             for side in range(2):
-                nx = x - 1 + side
-                ny = y - side
-                if nx >= 0 and ny >= 0:
-                    a = row_start[x, y]
-                    b = row_start[nx, ny]
-                    while a < row_start[x, y + 1] and b < row_start[nx, ny + 1]:
-                        if low[a] < high[b] and low[b] < high[a]:
+                other = row - wp.where(side == 0, runs.shape[1], 1)
+                if (side == 0 and x > 0) or (side == 1 and y > 0):
+                    a = runs.row_start[row]
+                    b = runs.row_start[other]
+                    while a < runs.row_start[row + 1] and b < runs.row_start[other + 1]:
+                        if runs.low[a] < runs.high[b] and runs.low[b] < runs.high[a]:
                             p = _root(parent, a)
                             q = _root(parent, b)
                             parent[wp.max(p, q)] = wp.min(p, q)
-                        if high[a] < high[b]:
+                        if runs.high[a] < runs.high[b]:
                             a += 1
                         else:
                             b += 1

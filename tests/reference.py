@@ -345,7 +345,10 @@ class World:
         xs, vs, ms, bodies, springs, self.starts = [], [], [], [], [], []
         first = 0
         for number, body in enumerate(scene.bodies):
-            cells, edge = (np.ones((1, 1, 1), bool), body.size) if body.type == "cube" else body.grid()[::2]
+            if body.type == "cube":
+                cells, edge = np.ones((1, 1, 1), bool), body.size
+            else:
+                cells, edge = body.grid()[0].dense(), body.grid()[2]
             lattice, unit = build(cells, body.particles_per_edge), edge / (body.particles_per_edge - 1)
             material = scene.materials[body.material]
             rest_shape = unit * np.array([key[0] for key in lattice.keys]) - edge * np.array(cells.shape) / 2

@@ -16,6 +16,7 @@ import warp as wp
 from worlds import make_scene
 
 import warpjelly.kernels
+from warpjelly.cells import Cells
 from warpjelly.device import start_warp
 from warpjelly.kernels import springs
 from warpjelly.simulator import Simulator
@@ -58,7 +59,7 @@ def launch_everything() -> None:
         )
     triangle = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
     voxelize(triangle, 2, method="vote", device="cpu")
-    find_pieces(np.ones((1, 1, 1), bool))
+    find_pieces(Cells.of(np.ones((1, 1, 1), bool)))
 
 
 def precisions_of(kernel: wp.Kernel) -> list[str]:

@@ -14,6 +14,7 @@ from pxr import UsdGeom
 from reference import EPSILON
 from worlds import make_material, make_scene, make_voxels
 
+from warpjelly.cells import Cells
 from warpjelly.errors import InputError
 from warpjelly.lattice import build_lattice
 from warpjelly.network import build_cloth, build_network
@@ -159,8 +160,8 @@ def test_cloth_is_covered_by_faces_once() -> None:
 def test_springs_know_how_many_cells_contain_them(seed: int, weighted: bool) -> None:
     """Share out the cells among the springs; weights leave springs, particles and faces as they are."""
     cells = np.random.default_rng(seed).random((3, 4, 3)) < 0.5
-    plain = build_lattice(cells, origin=np.zeros(3), cell_size=1.0)
-    lattice = build_lattice(cells, origin=np.zeros(3), cell_size=1.0, weighted=weighted)
+    plain = build_lattice(Cells.of(cells), origin=np.zeros(3), cell_size=1.0)
+    lattice = build_lattice(Cells.of(cells), origin=np.zeros(3), cell_size=1.0, weighted=weighted)
     for field in ("particles", "cell_counts", "surface_quads"):
         np.testing.assert_array_equal(getattr(lattice, field), getattr(plain, field))
     classes = lattice.classes
@@ -228,7 +229,9 @@ def test_a_box_pins_what_it_holds_before_the_body_is_placed() -> None:
     """Pin the lowest layer of a cube that is turned and moved away, at the box's very edge; all of it moves not."""
     pin = [{"lower": [-0.5, -0.5, -0.5], "upper": [0.5, -0.5, 0.5]}]
     simulator = Simulator(make_world("cube", pinned=pin), device="cpu")
-    lattice = build_lattice(np.ones((1, 1, 1), bool), origin=np.full(3, -0.5), cell_size=1.0, particles_per_edge=4)
+    lattice = build_lattice(
+        Cells.of(np.ones((1, 1, 1), bool)), origin=np.full(3, -0.5), cell_size=1.0, particles_per_edge=4
+    )
     np.testing.assert_array_equal(simulator.model.particle_inv_mass.numpy() == 0, lattice.particles[:, 1] < -0.4)
     frozen = Simulator(make_world("cube", pinned=[{"lower": [-1.0] * 3, "upper": [1.0] * 3}]), device="cpu")
     start = frozen.positions

@@ -1,4 +1,5 @@
 import csv
+import io
 import json
 import logging
 import os
@@ -6,20 +7,25 @@ import re
 import shutil
 import subprocess
 import sys
+import zipfile
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from pxr import Usd, UsdGeom
 from world_files import WORLDS
 
 import warpjelly as wj
 from warpjelly import cli, plan
+from warpjelly.meshes import EXTENSIONS, EXTRA_EXTENSIONS
 from warpjelly.scene import Scene
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CUBE = str(SCENES / "jello_cube.toml")
 TREE = SCENES / "models" / "tree.obj"
+
+NOISE = np.random.default_rng(0).bytes(3000)
 
 MODEL_SCENE = """
 [materials.m]
@@ -46,6 +52,13 @@ def warpjelly(monkeypatch, capfd):
     yield call
     # It would write to a stream that is closed after the test.
     logging.getLogger("warpjelly").handlers = []
+
+
+def header_of(shape: tuple[int, ...]) -> bytes:
+    """Return the header of a NumPy file of bool."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "|b1", "fortran_order": False, "shape": shape})
+    return file.getvalue()
 
 
 def one_line(stderr: str) -> str:
@@ -270,12 +283,14 @@ def test_wrong_arguments_exit_with_2_and_one_line(warpjelly, tmp_path, monkeypat
         ("nan.obj", b"v 0 0 nan\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
         ("index.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "index.obj"),
         ("dot.obj", b"v 1 1 1\nv 1 1 1\nv 1 1 1\nf 1 2 3\n", "dot.obj"),
+        ("inf.obj", b"v 0 0 inf\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "finite"),
         ("flat.obj", b"v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "no cell of the grid"),
-        ("noise.stl", bytes(range(256)), "noise.stl"),
-        ("words.stl", b"this is not a mesh", "words.stl"),
-        ("noise.glb", bytes(range(256)), "noise.glb"),
-        ("noise.3mf", bytes(range(256)), "noise.3mf"),
-        ("noise.usdz", bytes(range(256)), "noise.usdz: not a readable USD file"),
+        *((f"empty{kind}", b"", "no triangles") for kind in (*EXTENSIONS, *EXTRA_EXTENSIONS)),
+        *((f"noise{kind}", NOISE, f"noise{kind}") for kind in (*EXTENSIONS, *EXTRA_EXTENSIONS)),
+        ("short.glb", trimesh.creation.box().export(file_type="glb")[:-9], "not a sound .glb file"),
+        ("short.ply", trimesh.creation.box().export(file_type="ply")[:-9], "it ends too early"),
+        ("short.stl", trimesh.creation.box().export(file_type="stl")[:-9], "not a sound .stl file"),
+        ("words.stl", b"this is not a mesh", "not a sound .stl file"),
         ("empty.usda", b"#usda 1.0\n", "no mesh to be seen below /; there is none in this file"),
         ("model.xyz", b"0 0 0\n", "unknown mesh format '.xyz'"),
         ("huge.obj", b"v 0 0 0\nv 1e200 0 0\nv 0 1 0\nf 1 2 3\n", "m large"),
@@ -304,7 +319,7 @@ def test_a_scene_that_cannot_fit_is_refused_with_the_numbers(warpjelly, tmp_path
     assert "of 1.0 GB" in err
     code, _, err = warpjelly("check", SCENES / "tree_drop.toml", "--set", "bodies.tree.resolution=4096")
     assert code == 2
-    assert "a grid of" in one_line(err)
+    assert "bodies.tree: voxels at resolution 4,096 need about" in one_line(err)
 
 
 @pytest.mark.parametrize(
@@ -459,12 +474,18 @@ def test_voxelize_refuses_in_one_line(warpjelly, tmp_path, monkeypatch, argument
 @pytest.mark.parametrize(
     ("arrays", "said"),
     [
-        ({"cells": np.zeros((2, 2, 2), bool)}, "one of them occupied"),
+        ({"cells": np.zeros((2, 2, 2), bool)}, "none of its cells is occupied"),
         ({"cells": np.ones((2, 2), bool)}, "cells must be [x, y, z]"),
         ({"other": np.ones((2, 2, 2), bool)}, "cells"),
         ({"cells": np.ones((1, 1, 1), bool), "cell_size": np.nan}, "must be lengths"),
         ({"cells": np.ones((1, 1, 1), bool), "origin": [0.0, np.inf, 0.0]}, "must be lengths"),
-        ({"cells": np.ones((1, 1, 1), bool), "origin": [0.0, 0.0]}, "must be lengths"),
+        ({"cells": np.ones((1, 1, 1), bool), "origin": [0.0, 0.0]}, "origin must have 3 numbers, not [2]"),
+        ({"cells": np.ones((1, 1, 1), bool), "origin": np.zeros(10**6)}, "origin has 1000000 numbers; there may be 3"),
+        ({"cells": np.ones((1, 1, 1), bool), "cell_size": [0.1, 0.2]}, "cell_size has 2 numbers; there may be 1"),
+        ({"cells": np.array([[[None]]], dtype=object)}, "cells must be numbers, not object"),
+        ({"cells": np.array([[["a"]]])}, "cells must be numbers"),
+        ({"cells": np.full((2, 2, 2), np.nan)}, "some are NaN"),
+        ({"cells": np.ones((2, 0, 2), bool)}, "cells must be [x, y, z], not [2, 0, 2]"),
     ],
 )
 def test_a_broken_grid_is_refused_in_one_line(warpjelly, tmp_path, arrays, said):
@@ -476,6 +497,69 @@ def test_a_broken_grid_is_refused_in_one_line(warpjelly, tmp_path, arrays, said)
     assert (code, out) == (2, "")
     assert said in one_line(err)
     assert "grid.npz" in err
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [
+        (None, "not a zip file"),
+        (b"noise", "reading magic string"),
+        (header_of((1 << 20, 1 << 20, 1 << 10)) + bytes(100), "there may be 8,589,934,592"),
+        (header_of((1, 1, 1 << 32)) + bytes(100), "it ends too early"),
+        (header_of((1 << 32, 1, 1)) + bytes(100), "it ends too early"),
+    ],
+)
+def test_a_grid_that_promises_too_much_is_refused_at_once(warpjelly, tmp_path, entry, said):
+    """Refuse files that are no archive, that lie about their size, and those whose cells are too many to read."""
+    (tmp_path / "grid.npz").write_bytes(NOISE)
+    if entry is not None:
+        with zipfile.ZipFile(tmp_path / "grid.npz", "w") as archive:
+            archive.writestr("cells.npy", entry)
+    scene = tmp_path / "scene.toml"
+    scene.write_text('[materials.jelly]\n[[bodies]]\ntype = "voxels"\nmaterial = "jelly"\nfile = "grid.npz"\n')
+    code, out, err = warpjelly("check", scene)
+    assert (code, out) == (2, "")
+    assert said in one_line(err)
+
+
+@pytest.mark.parametrize("kind", ["obj", "npz"])
+def test_a_folder_is_no_file(warpjelly, tmp_path, kind):
+    """Say that what should be a model or a grid is a folder."""
+    (tmp_path / f"thing.{kind}").mkdir()
+    scene = tmp_path / "scene.toml"
+    text = MODEL_SCENE.replace("FILE", f"thing.{kind}")
+    scene.write_text(text if kind == "obj" else text.replace('"model"', '"voxels"').replace("resolution = 4", ""))
+    code, out, err = warpjelly("check", scene)
+    assert (code, out) == (2, "")
+    assert "it is a folder, not a file" in one_line(err)
+    code, _, err = warpjelly("voxelize", tmp_path / f"thing.{kind}", "-n", 4)
+    assert (code, one_line(err)) == (2, f"error: {tmp_path / f'thing.{kind}'}: it is a folder, not a file")
+
+
+def test_a_model_without_voxels_names_a_resolution_that_has_some(warpjelly, tmp_path):
+    """Say from which resolution on a thin plate has voxels, and find some there; a sheet has none but with its key."""
+    plate = trimesh.creation.box((1.0, 0.9, 0.05)).apply_translation([0.0, 0.0, 0.07])
+    plate.apply_transform(trimesh.transformations.rotation_matrix(0.7, [1.0, 2.0, 3.0]))
+    plate.export(tmp_path / "plate.ply")
+    code, _, err = warpjelly("voxelize", tmp_path / "plate.ply", "-n", 2)
+    found = re.search(r"resolution (\d+) has some, and keep_thin_parts fills", one_line(err))
+    assert (code, bool(found)) == (2, True)
+    assert warpjelly("voxelize", tmp_path / "plate.ply", "-n", found[1])[0] == 0
+    (tmp_path / "flat.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
+    code, _, err = warpjelly("voxelize", tmp_path / "flat.obj", "-n", 4)
+    assert (code, "has some" in err) == (2, False)
+    assert warpjelly("voxelize", tmp_path / "flat.obj", "-n", 4, "--keep-thin-parts")[0] == 0
+
+
+def test_check_names_the_memory_of_the_largest_bodies(warpjelly, tmp_path):
+    """Share the estimate of memory among bodies, the largest first."""
+    code, out, _ = warpjelly("check", SCENES / "pile.toml", "--json")
+    figures = json.loads(out)
+    shares = figures["body_memory_bytes"]
+    assert (code, len(shares)) == (0, 10)
+    assert 0 < sum(shares.values()) < figures["memory_bytes"]
+    code, out, _ = warpjelly("check", SCENES / "pile.toml")
+    assert len(re.findall(r"^ +[0-9.]+ GB of it for '", out, re.MULTILINE)) == 3
 
 
 def test_a_plane_that_faces_away_is_warned_of(warpjelly, tmp_path):

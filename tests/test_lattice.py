@@ -13,6 +13,7 @@ from hypothesis.extra import numpy as arrays
 from reference import build, name_particles, unit_cells
 from worlds import make_scene, make_voxels
 
+from warpjelly.cells import Cells
 from warpjelly.kernels.springs import MAX_SPAN
 from warpjelly.lattice import Lattice, build_lattice, corner_labels, count_lattice
 from warpjelly.simulator import Simulator
@@ -24,7 +25,7 @@ ORIGIN = np.array([0.5, -2.0, 8.0])
 def build_on_grid(cells: np.ndarray, particles_per_edge: int = 2) -> tuple[Lattice, np.ndarray]:
     """Return a lattice of unit edge 1/4 m and the grid coordinates of its particles."""
     lattice = build_lattice(
-        cells, origin=ORIGIN, cell_size=0.25 * (particles_per_edge - 1), particles_per_edge=particles_per_edge
+        Cells.of(cells), origin=ORIGIN, cell_size=0.25 * (particles_per_edge - 1), particles_per_edge=particles_per_edge
     )
     vertices = (lattice.particles - ORIGIN) / 0.25
     np.testing.assert_array_equal(vertices, np.rint(vertices))
@@ -49,7 +50,7 @@ def check(cells: np.ndarray, particles_per_edge: int) -> None:
     assert Counter(zip(ends, kinds.tolist(), strict=True)) == Counter(expected.springs.items())
 
     # Planned before built: particles exactly, springs never too few.
-    particles, bound, _, surface = count_lattice(cells, particles_per_edge=particles_per_edge)
+    particles, bound, _, surface = count_lattice(Cells.of(cells), particles_per_edge=particles_per_edge)
     assert particles == len(lattice.particles)
     assert bound >= lattice.spring_count == len(springs)
     assert surface == len(lattice.surface_quads) + 2
@@ -155,7 +156,7 @@ def test_spring_bound_is_close_for_a_solid() -> None:
     """Bound the springs of a solid of 8^3 cubes within 10 %."""
     cells = np.ones((8, 8, 8), bool)
     lattice, _ = build_on_grid(cells)
-    assert lattice.spring_count <= count_lattice(cells)[1] <= 1.1 * lattice.spring_count
+    assert lattice.spring_count <= count_lattice(Cells.of(cells))[1] <= 1.1 * lattice.spring_count
 
 
 def test_corner_table_lists_connected_cells() -> None:

@@ -13,6 +13,7 @@ from PIL import Image
 from pxr import Usd, UsdGeom, UsdShade
 from worlds import make_scene
 
+from warpjelly.cells import Cells
 from warpjelly.colors import KIND_COLORS
 from warpjelly.embedding import containing_cells, embed, face_cells
 from warpjelly.lattice import Lattice, build_lattice
@@ -32,7 +33,7 @@ ORIGIN, CELL = np.array([-1.0, 0.5, 2.0]), 0.25
 def random_lattice(seed: int, particles_per_edge: int = 2) -> tuple[np.ndarray, Lattice]:
     """Return occupied unit cells and the lattice of them."""
     cells = np.random.default_rng(seed).random((4, 5, 3)) < 0.4
-    lattice = build_lattice(cells, origin=ORIGIN, cell_size=CELL, particles_per_edge=particles_per_edge)
+    lattice = build_lattice(Cells.of(cells), origin=ORIGIN, cell_size=CELL, particles_per_edge=particles_per_edge)
     for axis in range(3):
         cells = np.repeat(cells, particles_per_edge - 1, axis=axis)
     return cells, lattice
@@ -94,7 +95,7 @@ def test_embedded_points_follow_every_affine_motion(seed: int, particles_per_edg
 
 def test_far_points_are_carried_on_straight() -> None:
     """Continue the motion of the nearest point of the cell linearly, not with the products of trilinear weights."""
-    lattice = build_lattice(np.ones((1, 1, 1), bool), origin=np.zeros(3), cell_size=1.0)
+    lattice = build_lattice(Cells.of(np.ones((1, 1, 1), bool)), origin=np.zeros(3), cell_size=1.0)
     point = np.array([[11.0, 11.0, 11.0]])
     particles, weights = embed(lattice, point, np.zeros((1, 3), np.int32))
     # One corner lifted by d lifts the nearest point by d, and each axis adds its slope d times the 10 cells.
@@ -140,7 +141,7 @@ def sphere_cells(radius: int) -> np.ndarray:
 def test_smooth_surfaces_lose_the_steps_but_not_the_volume() -> None:
     """Compare the surface of a ball of cells with the ball: normals, volume, and how far it is from round."""
     radius = 8
-    lattice = build_lattice(sphere_cells(radius), origin=np.full(3, -8.0), cell_size=1.0)
+    lattice = build_lattice(Cells.of(sphere_cells(radius)), origin=np.full(3, -8.0), cell_size=1.0)
     meshes = {}
     for surface in ("voxels", "smooth"):
         shape = only(shapes_of("ball", lattice, Output(surface=surface)), "surface")
@@ -164,7 +165,7 @@ def test_smooth_surfaces_of_cells_that_only_touch_stay_apart() -> None:
     """Hang each point on particles of its own cells, be the other cell ever so near."""
     cells = np.zeros((2, 2, 1), bool)
     cells[0, 0] = cells[1, 1] = True
-    lattice = build_lattice(cells, origin=np.zeros(3), cell_size=1.0)
+    lattice = build_lattice(Cells.of(cells), origin=np.zeros(3), cell_size=1.0)
     shape = only(shapes_of("two", lattice, Output(surface="smooth")), "surface")
     for point, particle in enumerate(lattice.surface_particles):
         assert particle in shape.particles[point]

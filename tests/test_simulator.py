@@ -244,7 +244,7 @@ def test_mirrored_scene_gives_the_mirrored_result(axis: int, device: str) -> Non
     mirrored["colliders"] = [mirror(collider) for collider in plain["colliders"]]
     mirrored["bodies"] = [mirror(body) for body in plain["bodies"]]
     grid, *_ = make_scene(**plain).bodies[0].grid()
-    mirrored["bodies"][0]["layers"] = make_voxels(np.flip(grid, axis))["layers"]
+    mirrored["bodies"][0]["layers"] = make_voxels(np.flip(grid.dense(), axis))["layers"]
     scenes = make_scene(**plain), make_scene(**mirrored)
 
     # Which particle becomes which: its vertex and its cells are mirrored within the grid.

@@ -10,6 +10,7 @@ import warp as wp
 from reference import EPSILON, ROUND_OFF, elastic_energy, spring_forces
 from worlds import make_material, make_scene, make_voxels
 
+from warpjelly.cells import Cells
 from warpjelly.kernels import springs
 from warpjelly.lattice import build_lattice
 from warpjelly.model import PRECISIONS, spring_classes
@@ -210,7 +211,9 @@ def test_spans_of_every_length_match_the_reference(gap: int, precision: str, dev
 def test_lattices_match_the_reference(precision: str, device: str) -> None:
     """Add the forces of a strained random lattice."""
     rng = np.random.default_rng(5)
-    lattice = build_lattice(rng.random((3, 3, 3)) < 0.6, origin=np.zeros(3), cell_size=0.2, particles_per_edge=3)
+    lattice = build_lattice(
+        Cells.of(rng.random((3, 3, 3)) < 0.6), origin=np.zeros(3), cell_size=0.2, particles_per_edge=3
+    )
     x = lattice.particles + rng.normal(scale=0.02, size=lattice.particles.shape)
     classes = spring_classes([Material.model_validate(make_material(300.0, 0.5))], lattice)
     check_kernels(x, rng.normal(size=x.shape), lattice.spans, classes, precision, device)
@@ -223,7 +226,7 @@ def test_strain_law_is_hooke_with_constants_over_the_rest_length(kind: int) -> N
     tables = {name: {"stiffness": k, "damping": d} for name, (k, d) in constants.items()}
     rest = 0.2 * [1, 2**0.5, 3**0.5, 2][kind]
     k, d = list(constants.values())[[0, 1, 1, 2][kind]]
-    lattice = build_lattice(np.ones((1, 1, 1), bool), origin=np.zeros(3), cell_size=0.2)
+    lattice = build_lattice(Cells.of(np.ones((1, 1, 1), bool)), origin=np.zeros(3), cell_size=0.2)
     hooke = spring_classes([Material.model_validate({"law": "hooke", **tables})], lattice)[kind]
     strain = spring_classes([Material.model_validate({"law": "strain", **tables})], lattice)[kind]
     # One multiplication, division or root each.
@@ -239,7 +242,9 @@ def test_forces_of_a_body_match_the_laws(law: str, device: str) -> None:
     body = make_voxels(np.ones((2, 1, 1), bool), cell_size=0.3, particles_per_edge=3, angular_velocity=[1.0, -2.0, 3.0])
     simulator = Simulator(make_scene(materials={"jelly": material}, bodies=[body]), device=device)
     v = simulator.velocities
-    lattice = build_lattice(np.ones((2, 1, 1), bool), origin=[-0.3, -0.15, -0.15], cell_size=0.3, particles_per_edge=3)
+    lattice = build_lattice(
+        Cells.of(np.ones((2, 1, 1), bool)), origin=[-0.3, -0.15, -0.15], cell_size=0.3, particles_per_edge=3
+    )
     np.testing.assert_allclose(simulator.positions, lattice.particles, rtol=0, atol=EPSILON["float64"])
     ends, kinds = lattice.springs()
     rest = 0.15 * np.array([1, 2**0.5, 3**0.5, 2])[kinds]

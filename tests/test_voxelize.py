@@ -11,6 +11,9 @@ import trimesh
 from manifold3d import Manifold, Mesh64
 from test_models import winding_numbers
 
+from warpjelly import voxelize as voxelize_module
+from warpjelly.cells import Cells
+from warpjelly.errors import SceneError
 from warpjelly.kernels.voxels import SUBCELLS
 from warpjelly.meshes import load_mesh
 from warpjelly.voxelize import (
@@ -79,7 +82,7 @@ def check(mesh: trimesh.Trimesh, resolution: int, device: str) -> VoxelGrid:
     assert (np.array(grid.cells.shape) * grid.cell_size >= (upper - lower) * (1 - 1e-8)).all()
     assert all((resolution - n) % 2 == 0 for n in grid.cells.shape)
     snapped = np.rint((triangles - grid.origin) * (SUBCELLS / grid.cell_size)).astype(np.int64)
-    np.testing.assert_array_equal(grid.cells, find_inside(snapped, grid.cells.shape))
+    np.testing.assert_array_equal(grid.cells.dense(), find_inside(snapped, grid.cells.shape))
     assert grid.open_columns == 0
     return grid
 
@@ -130,7 +133,7 @@ def test_random_polyhedra_match_the_exact_test(seed: int, device: str) -> None:
     hulls = [Manifold.hull_points(rng.normal(size=(12, 3)) + rng.normal(size=3)) for _ in range(3)]
     united = (hulls[0] + hulls[1] + hulls[2]).to_mesh64()
     mesh = trimesh.Trimesh(united.vert_properties, united.tri_verts.astype(np.int64), process=False)
-    assert check(mesh, 9, device).cells.any()
+    assert check(mesh, 9, device).cells.count
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -146,15 +149,15 @@ def test_meshes_match_the_exact_test_on_a_grid_of_another(seed: int, device: str
         mesh = trimesh.Trimesh(hull.vert_properties, hull.tri_verts.astype(np.int64), process=False)
         cells, notes = voxelize_on_grid(mesh, grid, device=device)
         snapped = np.rint((np.asarray(mesh.triangles) - grid.origin) * (SUBCELLS / grid.cell_size)).astype(np.int64)
-        np.testing.assert_array_equal(cells, find_inside(snapped, grid.cells.shape))
+        np.testing.assert_array_equal(cells.dense(), find_inside(snapped, grid.cells.shape))
         assert notes == []
-        found.append(cells.mean())
+        found.append(cells.count)
     assert found[0] < found[2]
     # The hull with a hole: rays through it are left out of the vote, wherever it is, and all others are right.
     mesh.update_faces(np.arange(len(mesh.faces)) > 0)
     voted, (note,) = voxelize_on_grid(mesh, grid, device=device)
     assert "not watertight; method vote" in note
-    np.testing.assert_array_equal(voted, cells)
+    np.testing.assert_array_equal(voted.dense(), cells.dense())
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -168,7 +171,7 @@ def test_vertices_on_cell_centres_match_the_exact_test(seed: int, device: str) -
     shell = solid.to_mesh64()
     mesh = trimesh.Trimesh(shell.vert_properties, shell.tri_verts.astype(np.int64), process=False)
     grid = check(mesh, 8, device)
-    assert not grid.cells.all()
+    assert grid.cells.count < grid.cells.grid_size
 
 
 def test_faces_on_cell_centres_keep_the_volume(device: str) -> None:
@@ -178,15 +181,15 @@ def test_faces_on_cell_centres_keep_the_volume(device: str) -> None:
     assert grid.cells.shape == (4, 4, 2)
     expected = np.zeros((4, 4, 2), bool)
     expected[:, :3, :1] = True
-    np.testing.assert_array_equal(grid.cells, expected)
+    np.testing.assert_array_equal(grid.cells.dense(), expected)
 
 
 def test_steps_on_cell_centres_match_the_exact_test(device: str) -> None:
     """Find the cells of stairs whose every face lies on cell centres or between cells."""
     boxes = [trimesh.creation.box(bounds=[[0, 0, 0], [8 - k, 0.5 + k, 8]]) for k in range(0, 8, 2)]
     grid = check(join(*boxes, trimesh.creation.box(bounds=[[0, 0, 0], [0.5, 8, 8]])), 8, device)
-    assert grid.cells.any()
-    assert not grid.cells.all()
+    assert grid.cells.count
+    assert grid.cells.count < grid.cells.grid_size
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
@@ -196,7 +199,7 @@ def test_mirrored_mesh_gives_mirrored_cells(name: str, axis: int, device: str) -
     triangles = np.asarray(CLOSED[name]().triangles)
     sign = np.where(np.arange(3) == axis, -1.0, 1.0)
     plain, mirrored = voxelize(triangles, 12, device=device), voxelize(triangles * sign, 12, device=device)
-    np.testing.assert_array_equal(np.flip(plain.cells, axis), mirrored.cells)
+    np.testing.assert_array_equal(np.flip(plain.cells.dense(), axis), mirrored.cells.dense())
 
 
 def test_translated_mesh_gives_the_same_cells(device: str) -> None:
@@ -204,7 +207,7 @@ def test_translated_mesh_gives_the_same_cells(device: str) -> None:
     triangles = np.asarray(CLOSED["union"]().triangles)
     offset = np.array([64.0, -3.0, 0.125])
     plain, moved = voxelize(triangles, 12, device=device), voxelize(triangles + offset, 12, device=device)
-    np.testing.assert_array_equal(plain.cells, moved.cells)
+    np.testing.assert_array_equal(plain.cells.dense(), moved.cells.dense())
     # Coordinates up to 66 are rounded to 7e-15.
     np.testing.assert_allclose(moved.origin, plain.origin + offset, rtol=0, atol=3e-14)
 
@@ -217,7 +220,7 @@ def test_models_keep_their_volume(name: str, resolution: int, device: str) -> No
     grid = voxelize(np.asarray(mesh.triangles), resolution, device=device)
     assert grid.open_columns == 0
     # Snapping a surface to cells moves each piece of it by at most half a cell along an axis, outwards or inwards.
-    error = abs(np.count_nonzero(grid.cells) * grid.cell_size**3 - mesh.volume)
+    error = abs(grid.cells.count * grid.cell_size**3 - mesh.volume)
     assert error <= mesh.area * grid.cell_size / 2
 
 
@@ -255,16 +258,16 @@ def test_winding_fills_what_any_surface_goes_round(device: str) -> None:
     grid = voxelize(np.asarray(mesh.triangles), 17, method="winding", device=device)
     windings = count_windings(mesh, grid)
     assert set(np.unique(windings)) == {0, 1, 2}
-    np.testing.assert_array_equal(grid.cells, windings != 0)
+    np.testing.assert_array_equal(grid.cells.dense(), windings != 0)
     assert grid.open_columns == 0
     parity = voxelize(np.asarray(mesh.triangles), 17, device=device)
-    np.testing.assert_array_equal(parity.cells, windings % 2 == 1)
+    np.testing.assert_array_equal(parity.cells.dense(), windings % 2 == 1)
 
 
-def test_windings_count_both_ways_up_to_seven(device: str) -> None:
-    """Fill inside of balls within balls, whichever way they turn, up to seven times round."""
-    balls = [trimesh.creation.icosphere(subdivisions=1, radius=radius) for radius in np.linspace(0.4, 1.0, 7)]
-    for count in range(1, 8):
+def test_windings_count_both_ways_and_far(device: str) -> None:
+    """Fill inside of balls within balls, whichever way they turn and however many there are."""
+    balls = [trimesh.creation.icosphere(subdivisions=1, radius=radius) for radius in np.linspace(0.4, 1.0, 20)]
+    for count in (1, 2, 7, 8, 16, 20):
         for turned_over in (False, True):
             mesh = trimesh.util.concatenate(balls[-count:])
             if turned_over:
@@ -272,7 +275,7 @@ def test_windings_count_both_ways_up_to_seven(device: str) -> None:
             grid = voxelize(np.asarray(mesh.triangles), 9, method="winding", device=device)
             windings = count_windings(mesh, grid)
             assert windings.min() == (-count if turned_over else 0)
-            np.testing.assert_array_equal(grid.cells, windings != 0)
+            np.testing.assert_array_equal(grid.cells.dense(), windings != 0)
 
 
 @pytest.mark.parametrize(
@@ -311,7 +314,38 @@ def test_a_vote_fills_a_mesh_with_holes(is_missing, device: str) -> None:
     triangles = np.asarray(box.triangles)
     whole = voxelize(triangles, 8, device=device)
     holed = voxelize(triangles[~is_missing(np.rint(box.face_normals))], 8, method="vote", device=device)
-    np.testing.assert_array_equal(holed.cells, whole.cells)
+    np.testing.assert_array_equal(holed.cells.dense(), whole.cells.dense())
+
+
+def test_too_many_ties_are_refused(device: str, monkeypatch) -> None:
+    """Refuse a box of three sides at a resolution at which all its cells would be looked at one by one."""
+    box = trimesh.creation.box()
+    triangles = np.asarray(box.triangles)[np.rint(box.face_normals).max(axis=1) > 0]
+    assert 0 < voxelize(triangles, 8, method="vote", device=device).cells.count < 8**3
+    monkeypatch.setattr(voxelize_module, "MAX_TIES", 500)
+    with pytest.raises(SceneError, match="open around 512 cells, more than 500"):
+        voxelize(triangles, 8, method="vote", device=device)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_thin_parts_of_any_slope_are_kept(seed: int, device: str) -> None:
+    """Keep every cell that triangles of any slope pass through, as sampled points say, with none occupied around it."""
+    rng = np.random.default_rng(seed)
+    blades = [turned(trimesh.creation.box(size), seed) for size in ((6.0, 4.0, 1e-3), (5.0, 1e-3, 1e-3))]
+    triangles = np.concatenate([np.asarray(mesh.triangles) for mesh in blades])
+    plain = voxelize(triangles, 13, method="winding", device=device)
+    kept = voxelize(triangles, 13, method="winding", keep_thin_parts=True, device=device).cells.dense()
+    weights = rng.dirichlet((1.0, 1.0, 1.0), (len(triangles), 20000))
+    points = np.einsum("tpc,tck->tpk", weights, triangles).reshape(-1, 3)
+    passed = np.unique(np.floor((points - plain.origin) / plain.cell_size).astype(int), axis=0)
+    dense = plain.cells.dense()
+    near = np.zeros(np.add(dense.shape, 2), bool)
+    for x, y, z in itertools.product(range(3), repeat=3):
+        near[x : x + dense.shape[0], y : y + dense.shape[1], z : z + dense.shape[2]] |= dense
+    inside = ((passed >= 0) & (passed < dense.shape)).all(axis=1)
+    far = passed[inside & ~near[tuple((passed + 1).clip(0, np.array(near.shape) - 1).T)]]
+    assert len(far) > 50
+    assert kept[tuple(far.T)].all()
 
 
 def test_a_vote_is_within_the_winding_number_of_a_broken_scan(device: str) -> None:
@@ -323,10 +357,10 @@ def test_a_vote_is_within_the_winding_number_of_a_broken_scan(device: str) -> No
     assert grid.method == "vote"
     assert "not watertight" in notes[0]
     whole = voxelize(np.asarray(mesh.triangles), 20, device=device)
-    centers = grid.origin + (np.argwhere(grid.cells != whole.cells) + 0.5) * grid.cell_size
+    centers = grid.origin + (np.argwhere(grid.cells.dense() != whole.cells.dense()) + 0.5) * grid.cell_size
     # Where a ray along each axis sees no hole, parity is right; the rest is at holes, near the surface.
     assert (np.abs(np.linalg.norm(centers, axis=1) - 1) < 0.25).all()
-    assert len(centers) < 0.03 * np.count_nonzero(whole.cells)
+    assert len(centers) < 0.03 * whole.cells.count
 
 
 def test_thin_parts_are_counted_and_kept_on_request(device: str) -> None:
@@ -335,21 +369,21 @@ def test_thin_parts_are_counted_and_kept_on_request(device: str) -> None:
     mesh = join(trimesh.creation.box((2.2, 2.0, 2.0)), fin)
     triangles = np.asarray(mesh.triangles)
     plain = voxelize(triangles, 10, device=device)
-    assert not plain.cells[6:].any()
+    assert not plain.cells.dense()[6:].any()
     # The fin's twelve triangles but for those hidden in the block; the cut may have split some.
     beyond = triangles[:, :, 0].max(axis=1) > 1.1 + 2 * plain.cell_size
     assert 6 <= plain.thin_triangles <= beyond.sum()
     kept = voxelize(triangles, 10, keep_thin_parts=True, device=device)
     assert kept.thin_triangles == plain.thin_triangles
-    added = np.argwhere(kept.cells & ~plain.cells)
-    assert (kept.cells | plain.cells == kept.cells).all()
+    added = np.argwhere(kept.cells.dense() & ~plain.cells.dense())
+    assert (kept.cells.dense() >= plain.cells.dense()).all()
     low = kept.origin + added * kept.cell_size
     assert (low[:, 1] <= 0.02).all()
     assert (low[:, 1] + kept.cell_size >= -0.02).all()
     assert (low[:, 0] >= 1.1 - kept.cell_size).all()
     # In one piece, up to the end of the fin.
-    assert kept.cells.any(axis=(1, 2)).all()
-    assert len(find_pieces(kept.cells)[1]) == 1
+    assert kept.cells.dense().any(axis=(1, 2)).all()
+    assert len(kept.piece_sizes) == 1
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -370,10 +404,10 @@ def test_pieces_match_a_flood_fill(seed: int) -> None:
                     label[at] = len(sizes)
                     sizes[-1] += 1
                     front += [tuple(np.add(at, sign * np.eye(3, dtype=int)[k])) for k in range(3) for sign in (-1, 1)]
-    _, found = find_pieces(cells)
+    _, found = find_pieces(Cells.of(cells))
     assert found.tolist() == sorted(sizes, reverse=True)
-    grid = VoxelGrid(cells, np.zeros(3), 1.0, "parity", 0, 0)
-    largest = keep_largest_piece(grid).cells
+    grid = VoxelGrid(Cells.of(cells), np.zeros(3), 1.0, "parity", 0, 0, found)
+    largest = keep_largest_piece(grid).cells.dense()
     assert np.count_nonzero(largest) == max(sizes)
     (number,) = set(np.unique(label[largest]))
     np.testing.assert_array_equal(largest, label == number)
@@ -389,4 +423,4 @@ def test_all_that_is_wrong_is_said_at_once(device: str) -> None:
         "it has 2 pieces that no face joins",
     ]
     alone, _ = voxelize_mesh(mesh, 30, pieces="largest", device=device)
-    assert find_pieces(grid.cells)[1].tolist() == [np.count_nonzero(alone.cells), 3 * 3 * 4]
+    assert grid.piece_sizes.tolist() == [alone.cells.count, 3 * 3 * 4]

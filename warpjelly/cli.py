@@ -12,6 +12,7 @@ import tomllib
 import traceback
 from collections.abc import Iterator
 from contextlib import contextmanager
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -152,6 +153,9 @@ def check(
     print(f"  particles  {figures['particles']:>13,}")
     print(f"  springs    {figures['springs']:>13,}")
     print(f"  memory     {figures['memory_bytes'] / 1e9:>13.2f} GB at the peak, about")
+    largest = sorted(figures["body_memory_bytes"].items(), key=itemgetter(1), reverse=True)[:3]
+    for name, share in largest if len(figures["body_memory_bytes"]) > 1 else []:
+        print(f"             {share / 1e9:>13.2f} GB of it for '{name}'")
     print(f"  step       {figures['dt'] * 1e3:>13.4g} ms, {figures['substeps']} a frame, {figures['frames']} frames")
     for name, limit in figures["dt_limit"].items():
         steps = [f"{step * 1e3:.4g} ms" if step else "none" for step in (limit, figures["dt_limit_in_contact"][name])]
@@ -185,13 +189,21 @@ def voxelize(
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Say what a model becomes: voxels, particles, springs, volume, and what is wrong with it."""
-    if not model.is_file():
-        raise InputError(f"{model}: no such file")
+    """Say what a model becomes: voxels, pieces, particles, springs, volume, and what is wrong with it.
+
+    Start with -n 20 and go up until nothing that matters is lost: twice the resolution is eight times the voxels. What
+    is printed here is what a scene gets from a body of type "model" with the same keys.
+
+    With -o FILE.npz the grid is kept, for a body with type = "voxels" and file = "FILE.npz".
+    """
+    from .files import missing, refuse_to_replace
+
+    if why := missing(model):
+        raise InputError(f"{model}: {why}")
     if output is not None and output.suffix.lower() != ".npz":
         raise InputError(f"{output}: a grid is written as .npz")
-    if output is not None and output.exists() and not force:
-        raise InputError(f"{output}: there already; choose another name, or replace it with --force")
+    if output is not None:
+        refuse_to_replace(output, force=force)
 
     from .plan import survey_model
     from .scenefile import read_scene
@@ -203,14 +215,15 @@ def voxelize(
     scene = read_scene({"materials": {"jelly": {}}, "bodies": [{**body, "resolution": resolution}]}, model)
     grid, figures = survey_model(scene)
     if output is not None:
-        from .voxelize import save_grid
+        from .gridfile import write_grid
 
-        save_grid(grid, output)
+        write_grid(output, grid.cells, grid.origin, grid.cell_size)
     if as_json:
         print(json.dumps(figures))
         return
     closed = "watertight" if figures["watertight"] else "not watertight"
-    share = f", {figures['volume'] / figures['mesh_volume']:.1%} of the mesh's" if figures["mesh_volume"] else ""
+    whole = figures["mesh_volume"]
+    share = f", {figures['volume'] / whole:.1%} of the mesh's {whole:.4g} m^3" if whole else ""
     print(f"{model}: {closed}, method {figures['method']}")
     cells = f"{' x '.join(map(str, grid.cells.shape))}, {grid.cell_size:.4g} m each"
     print(f"  voxels     {figures['voxels']:>13,} of {cells}")

@@ -7,6 +7,21 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
+from .errors import InputError
+
+
+def refuse_to_replace(path: Path, *, force: bool) -> None:
+    """Raise InputError where a file is there already, unless it may be replaced."""
+    if path.exists() and not force:
+        raise InputError(f"{path}: there already; choose another name, or replace it with --force")
+
+
+def missing(path: Path) -> str | None:
+    """Say why a file cannot be read, unless there is one."""
+    if path.is_file():
+        return None
+    return "it is a folder, not a file" if path.is_dir() else "no such file"
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:

@@ -12,6 +12,7 @@ space and springs come in long runs.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -29,14 +30,15 @@ from warpjelly.kernels.lattices import (
     MIXED,
     STRUCTURAL,
     Grid,
+    find_alike,
     find_faces,
-    find_patterns,
     find_spans,
     place_particles,
     vec8i,
 )
 from warpjelly.kernels.springs import MAX_SPAN
 
+from .cells import Cells, is_last
 from .device import start_warp
 from .errors import SceneError
 
@@ -52,8 +54,6 @@ DIRECTIONS += DIRECTIONS[:3]
 KINDS = np.repeat([STRUCTURAL, FACE_SHEAR, BODY_SHEAR, BEND], [3, 6, 4, 3])
 # Vertices are numbered in int32.
 MAX_VERTICES = 2**31 - 1
-# Corners of a cell as (x, y, z) bits; a corner's number is 4 x + 2 y + z. Cells around a vertex are numbered alike.
-CORNERS = [(x, y, z) for x in (0, 1) for y in (0, 1) for z in (0, 1)]
 
 
 @dataclass(frozen=True)
@@ -120,33 +120,34 @@ class Lattice:
 
 
 def build_lattice(
-    cells: np.ndarray,
+    cells: Cells,
     *,
     origin: np.ndarray,
     cell_size: float,
     particles_per_edge: int = 2,
     weighted: bool = False,
-    materials: np.ndarray | None = None,
+    materials: Sequence[Cells] = (),
 ) -> Lattice:
     """Join the occupied cells of a grid into one lattice.
 
     Args:
-        cells: occupied jelly cubes, bool [nx, ny, nz]; at least one.
+        cells: occupied jelly cubes; at least one.
         origin: lowest corner of the grid, [3], m.
         cell_size: edge of a jelly cube, m.
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
         weighted: tell springs apart by how many cells contain them, too; otherwise the classes of each material are the
             four kinds.
-        materials: material of each jelly cube, from 0 and below MAX_MATERIALS, uint8 [nx, ny, nz]; all 0 if None.
+        materials: jelly cubes of each material, at most MAX_MATERIALS; each cube has one. Of one material if empty.
 
     Raises:
         SceneError: the grid has more vertices than can be numbered.
     """
     unit = cell_size / (particles_per_edge - 1)
-    grid, particle_count = _number_particles(cells, particles_per_edge - 1, materials)
+    parts = particles_per_edge - 1
+    grid, particle_count = _number_particles(cells.refined(parts), [part.refined(parts) for part in materials])
     vertices = wp.empty(particle_count, dtype=wp.vec3i, device="cpu")
     cell_counts = wp.zeros((grid.material_count, particle_count), dtype=wp.uint8, device="cpu")
-    _launch(place_particles, grid.row_low.shape, [grid], [vertices, cell_counts])
+    _launch(place_particles, len(grid.run_row), [grid], [vertices, cell_counts])
     particles = vertices.numpy().astype(float)
     # In place: at this size each temporary counts.
     particles *= unit
@@ -171,38 +172,34 @@ def order_spans(spans: np.ndarray) -> np.ndarray:
     return spans[np.argsort(spans[:, 0], kind="stable")]
 
 
-def count_lattice(cells: np.ndarray, *, particles_per_edge: int = 2) -> tuple[int, int, int, int]:
+def count_lattice(
+    cells: Cells, *, particles_per_edge: int = 2, materials: Sequence[Cells] = ()
+) -> tuple[int, int, int, int]:
     """Count what ``build_lattice`` would make without making it, from the corners, edges and faces of the jelly cubes.
 
     Args:
-        cells: occupied jelly cubes, bool [nx, ny, nz].
+        cells: occupied jelly cubes.
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
+        materials: jelly cubes of each material, as for ``build_lattice``.
 
     Returns:
         The number of particles, exact; an upper bound of the number of springs, close for thick bodies; about the
         number of spans of springs and of points on the surface.
     """
-    cubes = int(np.count_nonzero(cells))
-    vertices = int(corner_labels()[1][_vertex_patterns(cells)].sum(dtype=np.int64))
-    faces = edges = 0
-    for axis in range(3):
-        across = np.moveaxis(cells, axis, -1)
-        faces += 2 * cubes - int(np.count_nonzero(across[..., 1:] & across[..., :-1]))
-        around = np.pad(across, [(1, 1), (1, 1), (0, 0)])
-        a, b, c, d = around[:-1, :-1], around[:-1, 1:], around[1:, :-1], around[1:, 1:]
-        # An edge between two cubes that only touch there is two edges.
-        edges += int(np.count_nonzero(a | b | c | d))
-        edges += int(np.count_nonzero((a & d & ~b & ~c) | (b & c & ~a & ~d)))
+    vertices = _Vertices(cells)
+    seen = np.bincount(vertices.patterns, vertices.lengths, minlength=256).astype(np.int64)
+    corners, edges, faces, cubes = (seen @ _pattern_parts()).tolist()
     n = particles_per_edge - 1
-    particles = vertices + edges * (n - 1) + faces * (n - 1) ** 2 + cubes * (n - 1) ** 3
+    particles = corners + edges * (n - 1) + faces * (n - 1) ** 2 + cubes * (n - 1) ** 3
     unit_edges = edges * n + faces * 2 * n * (n - 1) + cubes * 3 * n * (n - 1) ** 2
     unit_faces = faces * n**2 + cubes * 3 * n**2 * (n - 1)
     # Bend springs join consecutive structural ones, so there are fewer of them.
     # Each face of a cube is shared or exposed, and a closed surface of quads has about as many points as faces.
     exposed = 2 * faces - 6 * cubes
-    # Each of the directions of springs makes about one span of each row of unit cells, or more where it is long.
-    rows = np.count_nonzero(cells[:, :, 0]) + np.count_nonzero(cells[:, :, 1:] & ~cells[:, :, :-1])
-    spans = len(DIRECTIONS) * (rows * n**2 + cubes * n**3 // MAX_SPAN)
+    # Each of the directions of springs makes about one span of each row of unit cells alike, or more where it is long.
+    spans = len(DIRECTIONS) * sum(
+        part.run_count * n**2 + part.count * n**3 // MAX_SPAN for part in materials or [cells]
+    )
     return particles, 2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3, spans, exposed * n**2 + 2
 
 
@@ -232,14 +229,73 @@ def corner_labels() -> tuple[np.ndarray, np.ndarray]:
     return labels, counts
 
 
-def _vertex_patterns(units: np.ndarray) -> np.ndarray:
-    """Return the pattern of occupied cells around each grid vertex, uint8 [nx + 1, ny + 1, nz + 1]."""
-    nx, ny, nz = units.shape
-    padded = np.pad(units, 1)
-    pattern = np.zeros((nx + 1, ny + 1, nz + 1), np.uint8)
-    for number, (x, y, z) in enumerate(CORNERS):
-        pattern |= padded[x : x + nx + 1, y : y + ny + 1, z : z + nz + 1].astype(np.uint8) << np.uint8(number)
-    return pattern
+@functools.cache
+def _pattern_parts() -> np.ndarray:
+    """Count corners, edges, faces and cubes of jelly cubes by the vertex they begin at, for each pattern, [256, 4].
+
+    Edges, faces and cubes begin at their lowest vertex. An edge between two cubes that only touch there is two edges.
+    """
+    parts = np.zeros((256, 4), np.int64)
+    parts[:, 0] = corner_labels()[1]
+    for pattern in range(256):
+        for axis in (1, 2, 4):
+            above = [pattern >> cell & 1 for cell in range(8) if cell & axis]
+            parts[pattern, 1] += 2 if above in ([1, 0, 0, 1], [0, 1, 1, 0]) else any(above)
+            # The face across this axis lies between the last cell and the one below it.
+            parts[pattern, 2] += (pattern >> 7 | pattern >> (7 - axis)) & 1
+        parts[pattern, 3] = pattern >> 7
+    return parts
+
+
+class _Vertices:
+    """The vertices of occupied cells, as stretches along z of vertices with the same cells around them."""
+
+    def __init__(self, cells: Cells) -> None:
+        """Find them: what is occupied of the four rows of cells around a row of vertices changes seldom."""
+        nx, ny, nz = cells.shape
+        self.shape = (nx + 1, ny + 1, nz + 1)
+        row, z = np.divmod(cells.edges, nz + 1)
+        # Of the row of vertices at the low corner; a vertex is at a place as high as the lower face of a cell.
+        place = (row + row // ny) * (nz + 1) + z
+        # Where a row of cells changes on the (x, y) side of a row of vertices, as 4 place + 2 x + y.
+        rows_up = np.array([(1 - x) * (ny + 1) + (1 - y) for x in (0, 1) for y in (0, 1)])
+        changes = ((4 * (nz + 1) * rows_up + np.arange(4))[:, None] + 4 * place).ravel()
+        # In place, and in few bytes: at this size each temporary counts.
+        changes.sort()
+        rows_after = np.bitwise_xor.accumulate(np.uint8(1) << (changes & 3).astype(np.uint8))
+        changes >>= 2
+        last = is_last(changes)
+        places, above = changes[last], rows_after[last]
+        del changes, rows_after, last
+        below = np.concatenate([[np.uint8(0)], above[:-1]])[: len(above)]
+        # Bit 2 x + y of what is occupied above is bit 4 x + 2 y + 1 of a pattern, and of what is below 4 x + 2 y.
+        spread = np.array([sum((rows >> side & 1) << 2 * side for side in range(4)) for rows in range(16)], np.uint8)
+        self.patterns = np.stack([spread[below] | spread[above] << 1, 3 * spread[above]], axis=1).ravel()
+        """Occupied cells around the vertices of each stretch, uint8 [stretch_count]."""
+        lengths = np.ones((len(places), 2), np.int32)
+        lengths[:, 1] = np.where(above > 0, np.diff(places, append=0) - 1, 0)
+        self.lengths = lengths.ravel()
+        """Number of vertices of each stretch, int32 [stretch_count]."""
+        self.run_row, self.run_low = np.divmod(places[below == 0], nz + 1)
+        self.run_high = places[above == 0] % (nz + 1) + 1
+        """Rows of the runs of vertices that touch cells, and the z where they begin and end, int64 [run_count]."""
+        run_lengths = self.run_high - self.run_low
+        self.run_start = np.cumsum(run_lengths) - run_lengths
+        """Number of vertices before each run, int64 [run_count]."""
+
+    def number(self, materials: Sequence[Cells]) -> np.ndarray:
+        """Return the number of the material of the cell above each vertex, int8 [vertex_count]; 0 without a cell."""
+        change = np.zeros(self.lengths.sum(dtype=np.int64), np.int8)
+        height = self.shape[2]
+        first_places = self.run_row * height + self.run_low
+        for number, cells in enumerate(materials):
+            row, *ends = cells.runs()
+            row += row // cells.shape[1]
+            for z, step in zip(ends, (number, -number), strict=True):
+                place = row * height + z
+                run = np.searchsorted(first_places, place, side="right") - 1
+                change[self.run_start[run] + place - first_places[run]] += step
+        return np.cumsum(change, dtype=np.int8, out=change)
 
 
 def _launch(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any]) -> None:
@@ -247,56 +303,37 @@ def _launch(kernel: wp.Kernel, dim: Any, inputs: list[Any], outputs: list[Any]) 
     wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device="cpu")
 
 
-def _number_particles(cells: np.ndarray, refinement: int, materials: np.ndarray | None) -> tuple[Grid, int]:
+def _number_particles(units: Cells, materials: Sequence[Cells]) -> tuple[Grid, int]:
     """Return the grid of the kernels, with its particles in scan order, and how many there are."""
     start_warp()
     labels, counts = corner_labels()
-    nz = cells.shape[2]
-    occupied = cells.any(axis=2)
-    # From the first to the last occupied cell of each row of cells; an empty row begins above where it ends.
-    lowest = np.where(occupied, cells.argmax(axis=2), nz)
-    highest = np.where(occupied, nz - cells[:, :, ::-1].argmax(axis=2), 0)
-    # A row of vertices has those of the four rows of cells around it.
-    low = refinement * _reduce_around(np.minimum, lowest, refinement, nz)
-    high = refinement * _reduce_around(np.maximum, highest, refinement, 0) + 1
-    lengths = np.where(high > low, high - low, 0)
-    vertex_count = int(lengths.sum())
+    vertices = _Vertices(units)
+    vertex_count = int(vertices.lengths.sum(dtype=np.int64))
     if vertex_count > MAX_VERTICES:
         raise SceneError(f"a grid of {vertex_count:,} vertices is more than the {MAX_VERTICES:,} that can be numbered")
 
-    def array(data: np.ndarray, dtype: Any) -> wp.array:
+    def array(data: np.ndarray, dtype: Any = wp.int32) -> wp.array:
         return wp.array(data, dtype=dtype, device="cpu")
 
-    grid = Grid()
-    grid.cells = array(cells, wp.uint8)
-    grid.refinement = refinement
-    grid.labels = array(labels, wp.uint8)
-    grid.row_start = array((np.cumsum(lengths) - lengths.ravel()).reshape(lengths.shape), wp.int32)
-    grid.row_low, grid.row_high = array(low, wp.int32), array(low + lengths, wp.int32)
-    grid.patterns = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
-    grid.first = wp.empty(vertex_count, dtype=wp.int32, device="cpu")
-    grid.material_count, grid.alike = 1, grid.patterns
-    if materials is not None:
-        grid.material_count = int(materials[cells].max()) + 1
-        grid.materials = array(materials, wp.uint8)
-        grid.alike = wp.empty(vertex_count, dtype=wp.uint8, device="cpu")
-    _launch(find_patterns, lengths.shape, [grid, array(counts, wp.uint8)], [])
+    rows = vertices.shape[0] * vertices.shape[1]
+    patterns = np.repeat(vertices.patterns, vertices.lengths)
     # From how many particles each vertex has to how many there are before it.
-    first = grid.first.numpy()
+    first = counts.astype(np.int32)[patterns]
     last = int(first[-1])
-    first[1:] = np.cumsum(first[:-1])
+    np.cumsum(first[:-1], dtype=np.int32, out=first[1:])
     first[0] = 0
+    grid = Grid()
+    grid.labels, grid.shape = array(labels, wp.uint8), wp.vec3i(*vertices.shape)
+    grid.row_start = array(np.searchsorted(vertices.run_row, np.arange(rows + 1)))
+    grid.run_row, grid.run_low, grid.run_high = map(array, (vertices.run_row, vertices.run_low, vertices.run_high))
+    grid.run_start = array(vertices.run_start)
+    grid.patterns, grid.first = array(patterns, wp.uint8), array(first)
+    grid.material_count, grid.alike = max(1, len(materials)), grid.patterns
+    if len(materials) > 1:
+        grid.materials = array(vertices.number(materials), wp.uint8)
+        grid.alike = wp.empty_like(grid.patterns)
+        _launch(find_alike, len(grid.run_row), [grid], [])
     return grid, int(first[-1]) + last
-
-
-def _reduce_around(reduce: np.ufunc, rows: np.ndarray, refinement: int, empty: int) -> np.ndarray:
-    """Combine what is known of each row of cells, int [nx, ny], into rows of vertices, [refinement nx + 1, ...]."""
-    for axis in (0, 1):
-        rows = np.repeat(rows, refinement, axis=axis)
-        rows = np.pad(rows, [(1, 1) if other == axis else (0, 0) for other in (0, 1)], constant_values=empty)
-        low, high = (np.take(rows, np.arange(rows.shape[axis] - 1) + side, axis=axis) for side in (0, 1))
-        rows = reduce(low, high)
-    return rows
 
 
 def _connect(grid: Grid, unit: float, weighted: bool) -> tuple[np.ndarray, SpringClasses]:

@@ -154,6 +154,9 @@ def _read_triangles(path: Path) -> Model:
             part = from_polygons(mesh.vertices, np.full(len(faces), 3), faces.ravel(), names=[(node, name)])
             parts.append(placed(part, matrix))
     if path.suffix.lower() != ".3mf":
+        # Of what it cannot make out the reader says nothing.
+        if not any(len(part.counts) for part in parts):
+            raise ValueError("no triangles can be read from it; it may be cut off, or of another format")
         return Model(parts)
     # The reader says "millimeters" where the file says nothing.
     unit = str(scene.metadata["units"]).replace("millimeters", "millimeter")

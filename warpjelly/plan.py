@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -14,6 +15,7 @@ import numpy as np
 
 from warpjelly.kernels.lattices import MAX_MATERIALS
 
+from .cells import Cells
 from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
 from .network import build_cloth, build_network
@@ -32,6 +34,8 @@ from .scene import (
 from .shapes import PARTICLES, SPRINGS, SURFACE
 
 if TYPE_CHECKING:
+    import trimesh
+
     from .meshes import LoadedModel
     from .voxelize import VoxelGrid
 
@@ -41,18 +45,28 @@ log = logging.getLogger("warpjelly")
 MAX_ROW_BYTES = 2**31 - 1
 BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 
-# Bytes at the peak of building and running a scene, as measured: within 5 % for solid cubes of 128^3 and 200^3.
-BYTES_AT_REST = 290e6
+# Bytes at the peak of building and running a scene, as measured: within 15 %.
+BYTES_AT_REST = 300e6
 BYTES_PER_PARTICLE = {"float32": 240, "float64": 280}
 BYTES_PER_SPAN = 64
-# Resolutions to try where a model has no voxel.
-_FINER = [2**k for k in range(2, 9)]
-# Points, normals, colours and forces of a point at a frame; all of them are in memory until the stage is whole.
-BYTES_PER_SAMPLE = 36
+# With law "young" springs near the surface differ, so there are so many spans more per face of a jelly cube.
+YOUNG_SPANS = 2
+# Bytes at the peak of building a lattice alone.
+BYTES_PER_BUILT_PARTICLE, BYTES_PER_BUILT_SPAN = 60, 40
+# Resolutions to try where a model has no voxel; the last ones take a second.
+_FINER = [2**k for k in range(2, 11)]
+# Making what is shown; then points, normals, colours and forces of a point at a frame, all of which are in memory until
+# the stage is whole.
+BYTES_PER_POINT, BYTES_PER_SAMPLE = 145, 36
 # Splitting a surface by directions makes patches of the faces of jelly cubes, wider by so many points than by faces.
 _PATCH_MARGIN = 0.6
-# Scan conversion holds one byte per cell three times, counting what follows from them some more.
-BYTES_PER_GRID_CELL = 6
+# Reading a model needs packages, and the mesh itself.
+BYTES_OF_MODELS = 30e6
+BYTES_PER_TRIANGLE = 1000
+# Voxelising sorts where rays through the columns of cells cross the surface, and all that follows works on that.
+BYTES_PER_CROSSING = 150
+# Above this resolution a model is looked at coarsely first, so that one that cannot fit is refused at once.
+LARGE_RESOLUTION = 1024
 
 
 @dataclass(frozen=True)
@@ -73,8 +87,8 @@ class BodyPlan:
     """About as many points are shown as this."""
     voxel_count: int = 0
     """Number of jelly cubes."""
-    grid_size: int = 0
-    """Number of cells of its grid, occupied or not."""
+    triangle_count: int = 0
+    """Number of triangles of its model."""
     model: LoadedModel | None = None
     """The model that it is made from, where it is to be seen."""
 
@@ -102,15 +116,23 @@ class Plan:
         return sum(plan.spring_bound for plan in self.bodies)
 
     @property
+    def body_bytes(self) -> dict[str, int]:
+        """Estimated share of each body in the peak of memory, bytes by name."""
+        per_particle = BYTES_PER_PARTICLE[self.scene.solver.precision]
+        per_point = BYTES_PER_POINT + BYTES_PER_SAMPLE * self.scene.frame_count
+        return {
+            plan.body.name or "": per_particle * plan.particle_count
+            + BYTES_PER_SPAN * plan.span_estimate
+            + per_point * plan.point_estimate
+            + BYTES_PER_TRIANGLE * plan.triangle_count
+            for plan in self.bodies
+        }
+
+    @property
     def memory_bytes(self) -> int:
         """Estimated peak of memory, bytes."""
-        return int(
-            BYTES_AT_REST
-            + BYTES_PER_GRID_CELL * max(plan.grid_size for plan in self.bodies)
-            + BYTES_PER_PARTICLE[self.scene.solver.precision] * self.particle_count
-            + BYTES_PER_SPAN * sum(plan.span_estimate for plan in self.bodies)
-            + BYTES_PER_SAMPLE * self.scene.frame_count * sum(plan.point_estimate for plan in self.bodies)
-        )
+        models = any(plan.triangle_count for plan in self.bodies)
+        return int(BYTES_AT_REST + models * BYTES_OF_MODELS + sum(self.body_bytes.values()))
 
 
 def plan_scene(scene: Scene) -> Plan:
@@ -123,7 +145,11 @@ def plan_scene(scene: Scene) -> Plan:
     most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]
     if plan.particle_count > most:
         raise SceneError(f"{plan.particle_count:,} particles are more than the {most:,} that arrays can hold")
-    _require_memory(plan.memory_bytes, f"{plan.particle_count:,} particles and {plan.spring_bound:,} springs")
+    what = f"{plan.particle_count:,} particles and {plan.spring_bound:,} springs"
+    if len(plan.bodies) > 1:
+        name, share = max(plan.body_bytes.items(), key=itemgetter(1))
+        what += f", '{name}' {share / 1e9:.1f} GB of it,"
+    _require_memory(plan.memory_bytes, what)
     return plan
 
 
@@ -138,14 +164,15 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         particles = body.particles[0] * body.particles[1]
         build = partial(build_cloth, body.size, body.particles)
         return BodyPlan(body, [body.material], build, particles, 6 * particles, 6 * particles, particles)
-    model = None
-    regions: Iterable[np.ndarray] = ()
+    model, triangles = None, 0
+    regions: list[Cells] = []
     if isinstance(body, CubeBody):
-        cells, cell_size = np.ones((1, 1, 1), bool), body.size
+        cells, cell_size = Cells.of(np.ones((1, 1, 1), bool)), body.size
         origin = np.full(3, -body.size / 2)
     elif isinstance(body, ModelBody):
         voxelized = voxelize_model(body, up_axis=scene.up_axis)
         cells, origin, cell_size = voxelized.grid.cells, voxelized.grid.origin, voxelized.grid.cell_size
+        triangles = len(voxelized.model.mesh.faces)
         model = voxelized.model if scene.output.surface == "model" else None
         regions = voxelized.regions
     else:
@@ -153,16 +180,18 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         regions = body.region_cells()
     names, materials = _assign_materials(body, cells, regions)
     per_edge = body.particles_per_edge
+    weighted = any(scene.materials[name].law == "young" for name in names)
     build = partial(
         build_lattice,
         cells,
         origin=origin,
         cell_size=cell_size,
         particles_per_edge=per_edge,
-        weighted=any(scene.materials[name].law == "young" for name in names),
+        weighted=weighted,
         materials=materials,
     )
-    particles, springs, spans, faces = count_lattice(cells, particles_per_edge=per_edge)
+    particles, springs, spans, faces = count_lattice(cells, particles_per_edge=per_edge, materials=materials)
+    spans += YOUNG_SPANS * faces if weighted else 0
     points = {
         SURFACE: int(faces * (1 + _PATCH_MARGIN / (per_edge - 1)) ** 2)
         if model is None
@@ -171,41 +200,35 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         PARTICLES: particles,
     }
     shown = sum(points[name] for name in set(scene.output.show))
-    cubes = int(np.count_nonzero(cells))
-    return BodyPlan(body, names, build, particles, springs, spans, shown, cubes, cells.size, model)
+    return BodyPlan(body, names, build, particles, springs, spans, shown, cells.count, triangles, model)
 
 
 def _assign_materials(
-    body: CubeBody | VoxelsBody | ModelBody, cells: np.ndarray, regions: Iterable[np.ndarray]
-) -> tuple[list[str], np.ndarray | None]:
-    """Return the names of a body's materials, and which of them each cell has.
+    body: CubeBody | VoxelsBody | ModelBody, cells: Cells, regions: list[Cells]
+) -> tuple[list[str], list[Cells]]:
+    """Return the names of a body's materials, and the cells of each: only materials that some cell has.
 
     Args:
         body: names the material of each region, and that of all other cells.
-        cells: occupied cells, bool [nx, ny, nz].
-        regions: cells of each region, bool [nx, ny, nz] each; of several, the last one counts.
-
-    Returns:
-        Only materials that some cell has; their numbers, uint8 [nx, ny, nz], or None where there is one.
+        cells: of the body.
+        regions: cells of each region; of several, the last one counts.
 
     Raises:
         SceneError: a region has no cell of the body, or there are too many materials.
     """
-    if isinstance(body, CubeBody) or not body.regions:
-        return [body.material], None
-    names = list(dict.fromkeys([body.material, *(region.material for region in body.regions)]))
-    numbers = np.zeros(cells.shape, np.uint16)
-    for place, (region, inside) in enumerate(zip(body.regions, regions, strict=True)):
-        selected = inside & cells
-        if not selected.any():
-            raise SceneError(f"bodies.{body.name}.regions.{place}: has no jelly cube of the body")
-        numbers[selected] = names.index(region.material)
-    used, of_cell = np.unique(numbers[cells], return_inverse=True)
-    if len(used) > MAX_MATERIALS:
-        raise SceneError(f"bodies.{body.name}: has {len(used)} materials; a body can have {MAX_MATERIALS}")
-    materials = np.zeros(cells.shape, np.uint8)
-    materials[cells] = of_cell
-    return [names[number] for number in used], materials if len(used) > 1 else None
+    materials = {body.material: cells}
+    named = [] if isinstance(body, CubeBody) else body.regions
+    for number, (region, inside) in enumerate(zip(named, regions, strict=True)):
+        selected = cells.within(inside)
+        if not selected.count:
+            raise SceneError(f"bodies.{body.name}.regions.{number}: has no jelly cube of the body")
+        materials = {name: others.without(selected) for name, others in materials.items()}
+        name = region.material
+        materials[name] = materials[name].joined(selected) if name in materials else selected
+    materials = {name: part for name, part in materials.items() if part.count}
+    if len(materials) > MAX_MATERIALS:
+        raise SceneError(f"bodies.{body.name}: has {len(materials)} materials; a body can have {MAX_MATERIALS}")
+    return list(materials), list(materials.values())
 
 
 @dataclass(frozen=True)
@@ -217,8 +240,8 @@ class VoxelizedModel:
     watertight: bool
     model: LoadedModel
     """What it was made from, in the frame of the body."""
-    regions: list[np.ndarray]
-    """Cells of the grid in each of the body's regions, bool [nx, ny, nz]."""
+    regions: list[Cells]
+    """Cells of the grid in each of the body's regions."""
     mesh_volume: float
     """m^3; of a closed mesh that does not intersect itself, the volume inside."""
     warnings: list[str]
@@ -237,7 +260,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     """
     # These imports take most of a second, which scenes without models need not spend.
     from .meshes import load_model
-    from .voxelize import voxelize, voxelize_mesh
+    from .voxelize import LOOK_RESOLUTION, voxelize, voxelize_mesh
 
     model = load_model(body.file, up_axis=up_axis, prim=body.prim)
     scale = 1.0 if body.scale is None else body.scale
@@ -251,19 +274,32 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
             f"{body.file}: the model is {largest:.3g} m large; between {MIN_LENGTH:g} and {MAX_LENGTH:g} m can be "
             f"simulated: change bodies.{body.name}.scale or set fit"
         )
-    sides = np.ceil(mesh.extents / mesh.extents.max() * body.resolution).astype(int)
-    cell_count = int(np.prod(np.maximum(sides, 1).astype(object)))
+    # By the divergence theorem.
+    volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6
     _require_memory(
-        BYTES_AT_REST + BYTES_PER_GRID_CELL * cell_count, f"bodies.{body.name}: a grid of {cell_count:,} cells"
+        BYTES_AT_REST + BYTES_PER_CROSSING * _count_crossings(mesh, body),
+        f"bodies.{body.name}: voxels at resolution {body.resolution:,}",
     )
+    if body.resolution > LARGE_RESOLUTION and mesh.is_watertight:
+        coarse, _ = voxelize_mesh(mesh, LOOK_RESOLUTION, method=body.method, pieces=body.pieces)
+        # The count is right where the mesh overlaps itself, the volume where it is thin.
+        count = min(
+            coarse.cells.count * (body.resolution / LOOK_RESOLUTION) ** 3, volume * (body.resolution / largest) ** 3
+        )
+        _require_memory(
+            BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * count,
+            f"bodies.{body.name}: about {count:,.0f} voxels at resolution {body.resolution:,}",
+        )
     grid, notes = voxelize_mesh(
         mesh, body.resolution, method=body.method, keep_thin_parts=body.keep_thin_parts, pieces=body.pieces
     )
-    if not grid.cells.any():
-        finer = next((n for n in _FINER if n > body.resolution and voxelize(mesh.triangles, n).cells.any()), None)
+    if not grid.cells.count:
+        finer = (n for n in _FINER if n > body.resolution)
+        found = next((n for n in finer if voxelize(mesh.triangles, n, method=grid.method).cells.count), None)
         raise SceneError(
             f"{body.file}: no cell of the grid has its centre inside the model at resolution {body.resolution}; "
-            + (f"resolution {finer} has some" if finer else "set keep_thin_parts to fill those it passes through")
+            + (f"resolution {found} has some, and " if found else "")
+            + "keep_thin_parts fills those that it passes through"
         )
     for note in notes:
         log.warning("%s: %s", body.file, note)
@@ -273,15 +309,13 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
         else _cells_in_mesh(region, body, model, scale, grid, up_axis)
         for region in body.regions
     ]
-    # By the divergence theorem.
-    volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6
     return VoxelizedModel(grid, bool(mesh.is_watertight), model, regions, volume, notes)
 
 
 def _cells_in_mesh(
     region: ModelRegion, body: ModelBody, model: LoadedModel, scale: float, grid: VoxelGrid, up_axis: str
-) -> np.ndarray:
-    """Return the cells of a body's grid whose centres are inside a part of its model or another one, [nx, ny, nz].
+) -> Cells:
+    """Return the cells of a body's grid whose centres are inside a part of its model or another one.
 
     Args:
         region: names the part, or the other model, which is in the units of the body's.
@@ -314,24 +348,34 @@ def _cells_in_mesh(
     return inside
 
 
+def _count_crossings(mesh: trimesh.Trimesh, body: ModelBody) -> float:
+    """Return about how often rays along the columns of a model's grid cross its surface: as often as it is large."""
+    # Twice the area of the triangles as seen along each axis, in cells.
+    areas = np.abs(np.cross(*(np.diff(mesh.triangles, axis=1) * (body.resolution / mesh.extents.max())).swapaxes(0, 1)))
+    seen = areas.sum(axis=0) / 2
+    votes = body.method == "vote" or (body.method == "auto" and not mesh.is_watertight)
+    return float(seen.sum() if votes else seen[2])
+
+
 def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
     """Return the grid of a scene's only body, a model, and what becomes of it by name; SI units.
 
     Raises:
         InputError: the model cannot be used.
     """
-    from .voxelize import find_pieces
-
     (body,) = scene.bodies
     assert isinstance(body, ModelBody)
     voxelized = voxelize_model(body, up_axis=scene.up_axis)
     grid = voxelized.grid
+    particles, springs, spans, _ = count_lattice(grid.cells)
+    needed = BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * particles + BYTES_PER_BUILT_SPAN * spans
+    _require_memory(needed, f"{grid.cells.count:,} voxels, {particles:,} particles and {springs:,} springs")
     lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
     return grid, {
-        "voxels": int(np.count_nonzero(grid.cells)),
+        "voxels": grid.cells.count,
         "particles": len(lattice.particles),
         "springs": lattice.spring_count,
-        "pieces": len(find_pieces(grid.cells)[1]),
+        "pieces": len(grid.piece_sizes),
         "watertight": voxelized.watertight,
         "method": grid.method,
         "volume": grid.volume,

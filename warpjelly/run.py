@@ -177,7 +177,8 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     """Build a scene, step it for a moment, and say what a run of it takes.
 
     Returns:
-        ``particles, springs, voxels``; ``memory_bytes``, an estimate of the peak; ``dt`` [s], ``substeps`` a frame,
+        ``particles, springs, voxels``; ``memory_bytes``, an estimate of the peak, and ``body_memory_bytes``, of
+        each body by name; ``dt`` [s], ``substeps`` a frame,
         ``frames``; ``dt_limit`` and ``dt_limit_in_contact``, the largest stable step by integrator, s or None;
         ``seconds``, an estimate from this machine's speed now; ``device``.
 
@@ -211,6 +212,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
         "particles": sim.model.particle_count,
         "springs": sim.model.spring_count,
         "memory_bytes": plan.memory_bytes,
+        "body_memory_bytes": plan.body_bytes,
         "dt": sim.dt,
         "dt_limit": sim.step_limits(contacts=False),
         "dt_limit_in_contact": sim.step_limits(contacts=True),

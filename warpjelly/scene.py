@@ -10,6 +10,7 @@ import difflib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NoReturn, Self
@@ -31,7 +32,10 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
+from .cells import Cells
 from .errors import SceneError
+from .files import missing
+from .gridfile import read_grid
 
 # Coordinates and lengths beyond this [m], lengths below this [m] and other magnitudes beyond this are typing errors.
 MAX_LENGTH = 1e5
@@ -323,7 +327,7 @@ class VoxelsBody(Body):
         if (self.layers is None) == (self.file is None):
             raise PydanticCustomError("layers", "give either layers or file")
         if self.file is not None:
-            _read_grid(self.file)
+            self.grid()
         return self
 
     @model_validator(mode="after")
@@ -339,45 +343,46 @@ class VoxelsBody(Body):
                 refuse("layers", self.layers, why)
         return self
 
-    def grid(self) -> tuple[np.ndarray, np.ndarray, float]:
-        """Return the occupied cells, bool [x, y, z]; the lowest corner of the grid, [3], m; the edge of a cell, m."""
+    def grid(self) -> tuple[Cells, np.ndarray, float]:
+        """Return the occupied cells, the lowest corner of the grid, [3], m, and the edge of a cell, m."""
+        return self.kept_grid
+
+    @cached_property
+    def kept_grid(self) -> tuple[Cells, np.ndarray, float]:
+        """What ``grid`` returns, so that a file is read once."""
         if self.file is not None:
-            numbers, origin, own = _read_grid(self.file)
+            cells, origin, own = _read_grid(self.file)
             own = DEFAULT_CELL_SIZE if own is None else own
-            origin = -np.array(numbers.shape) * own / 2 if origin is None else origin
+            origin = -np.array(cells.shape) * own / 2 if origin is None else origin
             scale = 1.0 if self.cell_size is None else self.cell_size / own
-            return numbers != 0, scale * origin, scale * own
-        cells = self._drawing() != "."
+            return cells, scale * origin, scale * own
+        cells = Cells.of(self._drawing() != ".")
         cell_size = DEFAULT_CELL_SIZE if self.cell_size is None else self.cell_size
         return cells, -np.array(cells.shape) * cell_size / 2, cell_size
 
-    def region_cells(self) -> Iterator[np.ndarray]:
-        """Yield the cells of each region, bool [x, y, z]."""
-        if self.regions:
-            marks = self._drawing() if self.file is None else _read_grid(self.file)[0]
-            for region in self.regions:
-                yield marks == (region.value if region.symbol is None else region.symbol)
+    def region_cells(self) -> list[Cells]:
+        """Return the cells of each region."""
+        if self.file is not None:
+            return [_read_grid(self.file, region.value)[0] for region in self.regions]
+        return [Cells.of(self._drawing() == region.symbol) for region in self.regions]
 
     def _drawing(self) -> np.ndarray:
         """Return the characters of the layers, [x, y, z]."""
         drawn = np.array([[list(row) for row in layer] for layer in self.layers or []])
-        return np.ascontiguousarray(drawn.transpose(2, 0, 1))
+        return drawn.transpose(2, 0, 1)
 
 
-def _read_grid(file: Path) -> tuple[np.ndarray, np.ndarray | None, float | None]:
-    """Read the cells [x, y, z], 0 where empty, and what there is of origin [3] and cell size in an .npz file."""
+def _read_grid(file: Path, value: int | None = None) -> tuple[Cells, np.ndarray | None, float | None]:
+    """Read the cells of an .npz file that have a value, or are not 0, and what there is of origin [3] and cell size."""
     try:
-        with np.load(file, allow_pickle=False) as data:
-            cells = data["cells"]
-            own = float(data["cell_size"]) if "cell_size" in data else None
-            origin = data["origin"].astype(float) if "origin" in data else None
-        if cells.ndim != 3 or not (cells != 0).any():
-            raise ValueError(f"cells must be [x, y, z] with one of them occupied, not {list(cells.shape)}")
+        cells, origin, own = read_grid(file, value)
+        if value is None and not cells.count:
+            raise ValueError("none of its cells is occupied")
         sized = own is None or MIN_LENGTH <= own <= MAX_LENGTH
-        if not sized or (origin is not None and not (origin.shape == (3,) and np.abs(origin).max() <= MAX_LENGTH)):
+        if not sized or not (origin is None or np.abs(origin).max() <= MAX_LENGTH):
             given = "none" if origin is None else origin.tolist()
             raise ValueError(f"origin and cell_size must be lengths in m, not {given} and {own or 'none'}")
-    # NumPy raises whatever its parsing happens to trip over; all of it means that the file is broken.
+    # Reading raises whatever it happens to trip over; all of it means that the file is broken.
     except Exception as error:
         what = {"file": str(file), "why": str(error) or type(error).__name__}
         raise PydanticCustomError("grid", "{file}: not a grid of voxels: {why}", what) from error
@@ -387,8 +392,8 @@ def _read_grid(file: Path) -> tuple[np.ndarray, np.ndarray | None, float | None]
 def _existing(file: Path, info: ValidationInfo) -> Path:
     """Return the full path of a file that is given relative to the scene file."""
     file = Path((info.context or {}).get("folder", "."), file).absolute()
-    if not file.is_file():
-        raise PydanticCustomError("file", "no such file ({path})", {"path": str(file)})
+    if why := missing(file):
+        raise PydanticCustomError("file", "{why} ({path})", {"why": why, "path": str(file)})
     return file
 
 
@@ -431,8 +436,8 @@ class ModelRegion(Region):
             _read_grid(self.grid)
         return self
 
-    def grid_cells(self, shape: tuple[int, ...], origin: np.ndarray, cell_size: float) -> np.ndarray:
-        """Return which cells of a body's grid are in this region's grid, bool [nx, ny, nz].
+    def grid_cells(self, shape: tuple[int, int, int], origin: np.ndarray, cell_size: float) -> Cells:
+        """Return the cells of a body's grid whose centres are in this region's grid.
 
         Args:
             shape: of the body's grid, (nx, ny, nz).
@@ -443,20 +448,18 @@ class ModelRegion(Region):
             SceneError: the file does not say where its cells are, and they are not those of the body's grid.
         """
         assert self.grid is not None
-        numbers, own_origin, own_size = _read_grid(self.grid)
-        selected = numbers != 0 if self.value is None else numbers == self.value
+        cells, own_origin, own_size = _read_grid(self.grid, self.value)
         if own_origin is None or own_size is None:
-            if numbers.shape != shape:
-                whose = f"{list(numbers.shape)} of them, and the body's grid has {list(shape)}"
+            if cells.shape != shape:
+                whose = f"{list(cells.shape)} of them, and the body's grid has {list(shape)}"
                 raise SceneError(f"{self.grid}: has no origin and cell_size to say where its cells are: {whose}")
-            return selected
-        selected = np.pad(selected, 1)
-        # The cell that has each centre, along each axis; those beyond the grid are in the empty layer around it.
-        places = [
-            np.floor((low + (np.arange(count) + 0.5) * cell_size - own_low) / own_size).clip(-1, own_count).astype(int)
-            for count, low, own_count, own_low in zip(shape, origin, numbers.shape, own_origin, strict=True)
-        ]
-        return selected[np.ix_(*(place + 1 for place in places))]
+            return cells
+        return cells.sampled(
+            [
+                np.floor((low + (np.arange(count) + 0.5) * cell_size - own_low) / own_size)
+                for count, low, own_low in zip(shape, origin, own_origin, strict=True)
+            ]
+        )
 
 
 class ModelBody(Body):

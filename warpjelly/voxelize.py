@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
@@ -12,9 +12,9 @@ import warp as wp
 
 from warpjelly.kernels import voxels
 
+from .cells import Cells, add_up, is_last, unite
 from .device import start_warp
-from .errors import EnvironmentFailedError
-from .files import whole_file
+from .errors import SceneError
 
 # How cells are told to be inside, by the crossings of a ray from their centres: an odd number; a winding number that is
 # not 0; the majority of odd numbers along three axes.
@@ -23,10 +23,10 @@ METHODS = {
     "winding": "what any surface goes round is inside",
     "vote": "inside is where most of three axes say so",
 }
-# Planes of bits that count crossings.
-PARITY, WINDING = 1, 4
 # A grid and a mesh in it are together at most this many cells long; coordinates in subcells are exact up to there.
 MAX_CELLS = 5000
+# Cells that may be told one by one, by winding numbers: some ten seconds and a gigabyte.
+MAX_TIES = 1 << 24
 # The coarse grid on which a closed mesh is looked at before a method is chosen.
 LOOK_RESOLUTION = 64
 
@@ -35,8 +35,8 @@ LOOK_RESOLUTION = 64
 class VoxelGrid:
     """A cubic grid around a mesh, and which of its cells are inside."""
 
-    cells: np.ndarray
-    """Occupied cells, bool [nx, ny, nz]."""
+    cells: Cells
+    """Occupied cells."""
     origin: np.ndarray
     """Lowest corner, float64 [3], in units of the mesh."""
     cell_size: float
@@ -47,11 +47,13 @@ class VoxelGrid:
     """Columns of cells along z in which the surface is open."""
     thin_triangles: int
     """Triangles that pass through a cell with none inside around it: parts that are too thin for the grid."""
+    piece_sizes: np.ndarray
+    """Number of cells of each piece that is joined through faces, falling, int64 [piece_count]."""
 
     @property
     def volume(self) -> float:
         """Volume of the occupied cells, in units of the mesh."""
-        return int(np.count_nonzero(self.cells)) * self.cell_size**3
+        return self.cells.count * self.cell_size**3
 
 
 def voxelize_mesh(
@@ -80,16 +82,19 @@ def voxelize_mesh(
     chosen, faults = choose_method(triangles, closed=bool(mesh.is_watertight), device=device)
     notes = []
     chosen = chosen if method == "auto" else method
-    if faults:
-        notes.append(f"the mesh {' and '.join(faults)}; method {chosen}: {METHODS[chosen]}")
     grid = voxelize(triangles, resolution, method=chosen, keep_thin_parts=keep_thin_parts, device=device)
-    if grid.thin_triangles and grid.cells.any():
+    if faults:
+        note = f"the mesh {' and '.join(faults)}; method {chosen}: {METHODS[chosen]}"
+        if grid.open_columns:
+            note += f"; seen along z it is open in {grid.open_columns:,} of {math.prod(grid.cells.shape[:2]):,} columns"
+        notes.append(note)
+    if grid.thin_triangles and grid.cells.count:
         fate = "kept as the cells that they pass through" if keep_thin_parts else "lost; keep_thin_parts keeps them"
         notes.append(
             f"{grid.thin_triangles:,} of {len(triangles):,} triangles have parts with no cell inside near them, "
             f"thinner than a cell: {fate}, and a higher resolution shows them"
         )
-    _, sizes = find_pieces(grid.cells)
+    sizes = grid.piece_sizes
     if len(sizes) > 1:
         largest = ", ".join(f"{size:,}" for size in sizes[:5]) + (", ..." if len(sizes) > 5 else "")
         fate = (
@@ -99,19 +104,6 @@ def voxelize_mesh(
         if pieces == "largest":
             grid = keep_largest_piece(grid)
     return grid, notes
-
-
-def save_grid(grid: VoxelGrid, path: Path) -> None:
-    """Write cells, origin and cell size of a grid to an .npz file, which a body of voxels can use.
-
-    Raises:
-        EnvironmentFailedError: the file cannot be written.
-    """
-    try:
-        with whole_file(path) as unfinished:
-            np.savez_compressed(unfinished, cells=grid.cells, origin=grid.origin, cell_size=grid.cell_size)
-    except OSError as error:
-        raise EnvironmentFailedError(f"{path}: cannot write the grid: {error.strerror or error}") from error
 
 
 def choose_method(triangles: np.ndarray, *, closed: bool, device: str = "cpu") -> tuple[str, list[str]]:
@@ -124,14 +116,11 @@ def choose_method(triangles: np.ndarray, *, closed: bool, device: str = "cpu") -
     """
     if not closed:
         return "vote", ["is not watertight"]
-    grid = _Grid.around(triangles, LOOK_RESOLUTION, device)
-    seen = grid.fill(WINDING).seen
-    # Modulo 16: 1 to 7 times around, or -8 to -1 times.
+    least, most = _Grid.around(triangles, LOOK_RESOLUTION, device).fill().windings
     faults = []
-    if any(seen[8:]):
-        faults.append("is inside out" if not any(seen[1:8]) else "is partly inside out")
-    once = [1, 15]
-    if any(seen[number] for number in range(1, 16) if number not in once) or all(seen[number] for number in once):
+    if least < 0:
+        faults.append("is inside out" if most == 0 else "is partly inside out")
+    if most - least > 1:
         faults.append("intersects itself")
         return "winding", faults
     return "parity", faults
@@ -157,13 +146,16 @@ def voxelize(
             the generalised winding number decides.
         keep_thin_parts: occupy the cells, too, that thin parts of the surface pass through.
         device: where to scan-convert.
+
+    Raises:
+        SceneError: holes leave too much to winding numbers.
     """
     return _fill(triangles, _Grid.around(triangles, resolution, device), method, keep_thin_parts)
 
 
 def voxelize_on_grid(
     mesh: trimesh.Trimesh, grid: VoxelGrid, *, keep_thin_parts: bool = False, device: str = "cpu"
-) -> tuple[np.ndarray, list[str]]:
+) -> tuple[Cells, list[str]]:
     """Find the cells of a given grid whose centres are inside another mesh, by the method that suits it.
 
     Args:
@@ -173,58 +165,46 @@ def voxelize_on_grid(
         device: where to scan-convert.
 
     Returns:
-        The cells, bool [nx, ny, nz], and what the user should know of the mesh, a sentence each.
+        The cells, and what the user should know of the mesh, a sentence each.
+
+    Raises:
+        SceneError: holes leave too much to winding numbers.
     """
     triangles = np.asarray(mesh.triangles)
     method, faults = choose_method(triangles, closed=bool(mesh.is_watertight), device=device)
-    given = _Grid(triangles, np.array(grid.cells.shape), grid.origin, grid.cell_size, device)
+    given = _Grid(triangles, grid.cells.shape, grid.origin, grid.cell_size, device)
     notes = [f"the mesh {' and '.join(faults)}; method {method}: {METHODS[method]}"] if faults else []
     return _fill(triangles, given, method, keep_thin_parts).cells, notes
 
 
 def _fill(triangles: np.ndarray, grid: _Grid, method: str, keep_thin_parts: bool) -> VoxelGrid:
     """Find the cells of a grid that are inside, as ``voxelize`` says."""
-    if method == "vote":
-        filled = _vote(triangles, grid)
-    else:
-        filled = grid.fill(PARITY if method == "parity" else WINDING)
-    cells = filled.cells.numpy().view(bool)
-    thin_count, added = grid.find_thin_parts(filled.cells, keep=keep_thin_parts)
-    if keep_thin_parts:
-        cells |= added
+    filled = _vote(triangles, grid) if method == "vote" else grid.fill(parity=method == "parity")
+    thin_count, thin = grid.find_thin_parts(filled.cells, keep=keep_thin_parts)
+    cells = filled.cells.joined(thin)
     return VoxelGrid(
         cells=cells,
         origin=grid.origin,
         cell_size=grid.cell_size,
         method=method,
-        # Past its last crossing a column is outside again, unless the mesh is open there.
-        open_columns=int(np.count_nonzero(filled.open_columns)),
+        open_columns=filled.open_rows.run_count,
         thin_triangles=thin_count,
+        piece_sizes=find_pieces(cells)[1],
     )
 
 
-def find_pieces(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def find_pieces(cells: Cells) -> tuple[np.ndarray, np.ndarray]:
     """Find the pieces of a grid that are joined through faces.
 
-    Args:
-        cells: occupied cells, bool [nx, ny, nz].
-
     Returns:
-        The piece of each run of occupied cells along z in scan order, int [run_count], pieces from 0 by falling size;
-        the number of cells of each piece, int [piece_count].
+        The piece of each run of occupied cells, int [run_count], pieces from 0 by falling size; the number of cells of
+        each piece, int [piece_count].
     """
     start_warp()
-    nx, ny, _ = cells.shape
-    low, high, rows = _find_runs(cells)
-    row_start = np.searchsorted(rows, np.arange(nx * ny + 1)).astype(np.int32)
-    table = np.empty((nx, ny + 1), np.int32)
-    table[:, :-1] = row_start[:-1].reshape(nx, ny)
-    table[:, -1] = row_start[ny::ny]
-    parent = wp.array(np.arange(len(low)), dtype=wp.int32, device="cpu")
-    inputs = [wp.array(part, dtype=wp.int32, device="cpu") for part in (table, low, high)]
-    wp.launch(voxels.join_runs, dim=1, inputs=inputs, outputs=[parent], device="cpu")
+    parent = wp.array(np.arange(cells.run_count), dtype=wp.int32, device="cpu")
+    wp.launch(voxels.join_runs, dim=1, inputs=[_runs(cells, "cpu")], outputs=[parent], device="cpu")
     _, piece = np.unique(parent.numpy(), return_inverse=True)
-    sizes = np.bincount(piece, high - low).astype(np.int64)
+    sizes = np.bincount(piece, cells.edges[1::2] - cells.edges[::2]).astype(np.int64)
     order = np.argsort(-sizes, kind="stable")
     number = np.empty_like(order)
     number[order] = np.arange(len(order))
@@ -233,43 +213,37 @@ def find_pieces(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def keep_largest_piece(grid: VoxelGrid) -> VoxelGrid:
     """Return a grid of the largest of the pieces that are joined through faces alone."""
-    pieces, sizes = find_pieces(grid.cells)
-    if len(sizes) < 2:
-        return grid
-    low, high, _ = _find_runs(grid.cells)
-    cells = grid.cells.copy()
-    # In scan order, occupied cells are the runs one after the other.
-    cells[cells] = np.repeat(pieces == 0, high - low)
-    return replace(grid, cells=cells)
+    piece, sizes = find_pieces(grid.cells)
+    return replace(grid, cells=grid.cells.kept(piece == 0), piece_sizes=sizes[:1])
 
 
-def _find_runs(cells: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return where runs of occupied cells along z begin and end, and in which row nx * ny they are, int [run_count]."""
-    nx, ny, nz = cells.shape
-    padded = np.zeros((nx * ny, nz + 1), np.int8)
-    padded[:, :-1] = cells.reshape(nx * ny, nz)
-    change = np.flatnonzero(np.diff(padded.ravel(), prepend=np.int8(0)))
-    begin, end = change[::2], change[1::2]
-    return begin % (nz + 1), end % (nz + 1), begin // (nz + 1)
+def _runs(cells: Cells, device: str) -> voxels.Runs:
+    """Return cells as the kernels take them."""
+    runs = voxels.Runs()
+    runs.shape = wp.vec3i(*cells.shape)
+    _, *ends = cells.runs()
+    runs.row_start, runs.low, runs.high = (
+        wp.array(part, dtype=wp.int32, device=device) for part in (cells.row_start(), *ends)
+    )
+    return runs
 
 
 @dataclass(frozen=True)
 class _Filled:
     """What scan conversion finds."""
 
-    cells: wp.array
-    """uint8 [nx, ny, nz], 1 where the winding number is not 0."""
-    open_columns: np.ndarray
-    """bool [nx, ny]."""
-    seen: np.ndarray
-    """Whether a winding number was seen, bool [16], modulo 16 or 2."""
+    cells: Cells
+    open_rows: Cells
+    """Rows in which the surface is open: all of their cells, or none."""
+    windings: tuple[int, int]
+    """The least and the greatest winding number of a cell."""
 
 
 class _Grid:
     """A grid, and a mesh in its cells."""
 
     def __init__(
-        self, triangles: np.ndarray, shape: np.ndarray, origin: np.ndarray, cell_size: float, device: str
+        self, triangles: np.ndarray, shape: tuple[int, int, int], origin: np.ndarray, cell_size: float, device: str
     ) -> None:
         start_warp()
         self.device = device
@@ -283,74 +257,111 @@ class _Grid:
         cell_size = float((upper - lower).max()) / resolution
         # The cubic grid less the layers on both sides that the mesh does not reach, as long as there is one left.
         skipped = np.floor((resolution - (upper - lower) / cell_size) / 2 + 1e-9).astype(int)
-        shape = resolution - 2 * np.minimum(skipped, (resolution - 1) // 2)
-        return cls(triangles, shape, (lower + upper) / 2 - shape * cell_size / 2, cell_size, device)
+        nx, ny, nz = (resolution - 2 * np.minimum(skipped, (resolution - 1) // 2)).tolist()
+        origin = (lower + upper) / 2 - np.array((nx, ny, nz)) * cell_size / 2
+        return cls(triangles, (nx, ny, nz), origin, cell_size, device)
 
-    def fill(self, planes: int, axis: int = 2) -> _Filled:
-        """Count crossings with rays along an axis; cells and columns are those of axes turned until it is z."""
-        turned = _turned(axis)
-        nx, ny, nz = (int(self.shape[a]) for a in turned)
-        snapped = np.ascontiguousarray(self.snapped[:, :, turned])
-        with wp.ScopedDevice(self.device):
-            bits = wp.zeros((planes, nx, ny, nz // voxels.BITS_PER_WORD + 1), dtype=wp.uint32)
-            inputs: list[Any] = [wp.array(snapped, dtype=wp.int64), wp.vec3i(nx, ny, nz)]
-            wp.launch(voxels.add_crossings, dim=len(snapped), inputs=inputs, outputs=[bits])
-            cells = wp.empty((nx, ny, nz), dtype=wp.uint8)
-            open_columns = wp.empty((nx, ny), dtype=wp.uint8)
-            seen = wp.zeros(1 << WINDING, dtype=wp.int32)
-            wp.launch(voxels.fill_columns, dim=(nx, ny), inputs=[bits], outputs=[cells, open_columns, seen])
-        return _Filled(cells, open_columns.numpy() > 0, seen.numpy() > 0)
+    def fill(self, axis: int = 2, *, parity: bool = False) -> _Filled:
+        """Count crossings with rays along an axis; cells are those of axes turned until it is z.
 
-    def find_thin_parts(self, cells: wp.array, *, keep: bool) -> tuple[int, np.ndarray]:
+        Cells are filled where the surface goes round them, or, with parity, where it does an odd number of times.
+        """
+        turned = [(axis + 1) % 3, (axis + 2) % 3, axis]
+        shape = (self.shape[turned[0]], self.shape[turned[1]], self.shape[turned[2]])
+        triangles = wp.array(np.ascontiguousarray(self.snapped[:, :, turned]), dtype=wp.int64, device=self.device)
+        crossings, _ = self._collect(voxels.find_crossings, [triangles, wp.vec3i(*shape)])
+        places, windings = add_up(crossings)
+        rows, heights = np.divmod(places, shape[2] + 1)
+        ends = np.flatnonzero(is_last(rows))
+        # What is left over in a row does not count in the next one.
+        left = windings[ends]
+        if left.any():
+            windings -= np.repeat(np.append(0, left[:-1]), np.diff(ends, prepend=-1))
+        inside = windings % 2 == 1 if parity else windings != 0
+        is_open = rows[ends[inside[ends]]]
+        # Past the last cell there is nothing, also where the surface is open.
+        inside &= heights < shape[2]
+        open_rows = Cells(shape, (is_open[:, None] * (shape[2] + 1) + [0, shape[2]]).ravel())
+        places = np.append(places, open_rows.edges[1::2])
+        order = np.argsort(places, kind="stable")
+        cells = Cells.between(shape, places[order], np.append(inside, np.zeros(len(is_open), bool))[order])
+        return _Filled(cells, open_rows, (int(windings.min(initial=0)), int(windings.max(initial=0))))
+
+    def find_thin_parts(self, cells: Cells, *, keep: bool) -> tuple[int, Cells]:
         """Find parts of the surface with no occupied cell around them.
 
         Returns:
             The number of triangles that have such a part; where asked to keep them, the cells that these parts pass
-            through, with those that join them to the others, bool [nx, ny, nz].
+            through, with those that join them to the others, otherwise none.
         """
+        triangles = wp.array(self.snapped, dtype=wp.int64, device=self.device)
+        everyone = wp.ones(len(triangles), dtype=wp.int64, device=self.device)
+        inputs = [triangles, _runs(cells, self.device), True, everyone]
+        places, thin = self._collect(voxels.find_thin_parts, inputs)
+        found = _occupy(cells.shape, places if keep else places[:0])
+        if found.count:
+            joints, _ = self._collect(voxels.find_thin_parts, [triangles, _runs(found, self.device), False, thin])
+            found = _occupy(cells.shape, np.concatenate([places, joints]))
+        return int(np.count_nonzero(thin.numpy())), found
+
+    def _collect(self, kernel: wp.Kernel, inputs: list[Any]) -> tuple[np.ndarray, wp.array]:
+        """Return what a kernel finds of all triangles, int64 [count], and how much of each triangle, on the device."""
         with wp.ScopedDevice(self.device):
-            corners = wp.array(self.snapped / voxels.SUBCELLS, dtype=wp.vec3d)
-            thin = wp.zeros(len(corners), dtype=wp.uint8)
-            found, joints = (wp.zeros(cells.shape if keep else (0, 0, 0), dtype=wp.uint8) for _ in range(2))
-            wp.launch(voxels.find_thin_parts, dim=len(corners), inputs=[corners, cells, True], outputs=[thin, found])
-            count = int(np.count_nonzero(thin.numpy()))
-            if keep:
-                inputs = [corners, found, False]
-                wp.launch(voxels.find_thin_parts, dim=len(corners), inputs=inputs, outputs=[thin, joints])
-        return count, found.numpy().view(bool) | joints.numpy().view(bool)
+            starts, counts = (wp.zeros(len(self.snapped), dtype=wp.int64) for _ in range(2))
+            none = wp.empty(0, dtype=wp.int64)
+            wp.launch(kernel, dim=len(counts), inputs=[*inputs, starts], outputs=[none, counts])
+            total = np.cumsum(counts.numpy())
+            starts.assign(total - counts.numpy())
+            found = wp.empty(int(total[-1]), dtype=wp.int64)
+            if len(found):
+                wp.launch(kernel, dim=len(counts), inputs=[*inputs, starts], outputs=[found, counts])
+            return found.numpy(), counts
 
 
-def _turned(axis: int) -> list[int]:
-    """Return the axes in an order that ends with one of them."""
-    return [(axis + 1) % 3, (axis + 2) % 3, axis]
+def _occupy(shape: tuple[int, int, int], places: np.ndarray) -> Cells:
+    """Return the cells at some places, any number of times each."""
+    return unite(shape, np.concatenate([2 * places + 1, 2 * places + 2]))
 
 
 def _vote(triangles: np.ndarray, grid: _Grid) -> _Filled:
     """Let the parities along three axes vote, where the surface is not open; winding numbers break ties."""
-    votes = np.zeros(grid.shape, np.int8)
+    ballots = []
     for axis in range(3):
-        filled = grid.fill(PARITY, axis)
-        inside = filled.cells.numpy().astype(np.int8)
-        counted = (2 * inside - 1) * ~filled.open_columns[:, :, None]
-        # Back from the axes as they were turned.
-        votes += counted.transpose(np.argsort(_turned(axis)))
-    cells = votes > 0
-    tied = np.argwhere(votes == 0)
-    if len(tied):
-        cells[tuple(tied.T)] = _are_inside(triangles, grid, tied)
-    return _Filled(wp.array(cells, dtype=wp.uint8, device=grid.device), filled.open_columns, filled.seen)
+        filled = grid.fill(axis, parity=True)
+        counted = filled.cells.kept(~np.isin(filled.cells.runs()[0], filled.open_rows.runs()[0]))
+        # Two for a cell inside and one for any cell of an open row: three are a tie.
+        for part in (counted, counted, filled.open_rows):
+            # Back from the axes as they were turned.
+            for _ in range((axis + 1) % 3):
+                part = part.turned()
+            ballots.append(part.events())
+    places, votes = add_up(np.concatenate(ballots))
+    cells = Cells.between(grid.shape, places, votes > 3)
+    ties = Cells.between(grid.shape, places, votes == 3)
+    if ties.count > MAX_TIES:
+        raise SceneError(
+            f"as seen along all three axes the mesh is open around {ties.count:,} cells, more than {MAX_TIES:,}: close "
+            "it, lower the resolution, or choose another method"
+        )
+    if ties.count:
+        tied = ties.places()
+        won = _occupy(grid.shape, tied[_are_inside(triangles, grid, tied)])
+        cells = cells.joined(won)
+    return _Filled(cells, filled.open_rows, filled.windings)
 
 
-def _are_inside(triangles: np.ndarray, grid: _Grid, cells: np.ndarray) -> np.ndarray:
-    """Say whether the generalised winding number of the centres of cells [count, 3] is at least a half."""
+def _are_inside(triangles: np.ndarray, grid: _Grid, places: np.ndarray) -> np.ndarray:
+    """Say whether the generalised winding number of the centres of cells at places is at least a half."""
     corners = (triangles - grid.origin) / grid.cell_size
+    _, ny, nz = grid.shape
+    row, z = np.divmod(places, nz + 1)
     with wp.ScopedDevice(grid.device):
         mesh = wp.Mesh(
             points=wp.array(corners.reshape(-1, 3), dtype=wp.vec3f),
             indices=wp.array(np.arange(3 * len(corners)), dtype=wp.int32),
             support_winding_number=True,
         )
-        inside = wp.empty(len(cells), dtype=wp.uint8)
-        centers = wp.array(cells + 0.5, dtype=wp.vec3f)
-        wp.launch(voxels.find_windings, dim=len(cells), inputs=[mesh.id, centers], outputs=[inside])
+        inside = wp.empty(len(places), dtype=wp.uint8)
+        centers = wp.array(np.stack([row // ny, row % ny, z], axis=1) + 0.5, dtype=wp.vec3f)
+        wp.launch(voxels.find_windings, dim=len(places), inputs=[mesh.id, centers], outputs=[inside])
     return inside.numpy() > 0

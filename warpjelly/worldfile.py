@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from .errors import EnvironmentFailedError, InputError, SceneError
-from .files import whole_file
+from .files import refuse_to_replace, whole_file
 from .scene import (
     DEFAULT_PARTICLE_MASS,
     MAX_FPS,
@@ -225,8 +225,7 @@ def write_world(scene: Scene, path: str | Path, *, force: bool = False) -> None:
     path = Path(path)
     if path.suffix.lower() != SUFFIX:
         raise InputError(f"{path}: a world file ends in {SUFFIX}")
-    if path.exists() and not force:
-        raise InputError(f"{path}: exists already; replace it with --force")
+    refuse_to_replace(path, force=force)
     text = _format(scene)
     try:
         with whole_file(path) as unfinished:

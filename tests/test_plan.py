@@ -1,0 +1,99 @@
+"""What a scene is said to take, against what it takes."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import trimesh
+from worlds import make_material
+
+from warpjelly import plan
+from warpjelly.errors import SceneError
+from warpjelly.plan import plan_scene
+from warpjelly.scene import Scene
+
+# Runs a scene and prints what was planned and the greatest memory of the process, both in bytes.
+RUN = """
+import json, sys
+from pathlib import Path
+from warpjelly.plan import plan_scene
+from warpjelly.run import simulate
+from warpjelly.scene import Scene
+scene = Scene.model_validate(json.loads(sys.argv[1]))
+planned = plan_scene(scene).memory_bytes
+simulate(scene, output=sys.argv[2], device="cpu")
+status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+print(planned, 1024 * int(status["VmHWM"].split()[0]))
+"""
+
+
+def make_shell(folder: Path, thickness: float) -> Path:
+    """Write a hollow ball of radius 1, and return its file."""
+    outer, inner = (trimesh.creation.icosphere(subdivisions=5, radius=radius) for radius in (1.0, 1.0 - thickness))
+    inner.invert()
+    trimesh.util.concatenate([outer, inner]).export(folder / "shell.ply")
+    return folder / "shell.ply"
+
+
+def make_model(file: Path, resolution: int, **changes: Any) -> dict[str, Any]:
+    """Return a scene of one model."""
+    body = {"type": "model", "file": str(file), "resolution": resolution, "material": "jelly", **changes}
+    materials = {name: make_material(1.0, 0.0) for name in ("jelly", "stiff")}
+    return {"frames": 2, "gravity": [0.0, 0.0, 0.0], "materials": materials, "bodies": [body]}
+
+
+def make_pair(folder: Path, kind: str) -> list[dict[str, Any]]:
+    """Return two scenes, of which the second takes much more of what the kind is about."""
+    box, sphere = folder / "box.ply", folder / "sphere.ply"
+    trimesh.creation.box().export(box)
+    small, solid = make_model(box, 4), make_model(box, 96)
+    if kind == "packages":
+        return [small | {"bodies": [{"type": "cube", "material": "jelly", "particles_per_edge": 5}]}, small]
+    if kind == "triangles":
+        trimesh.creation.icosphere(subdivisions=7).export(sphere)
+        return [small, make_model(sphere, 4)]
+    if kind == "points":
+        return [make_model(make_shell(folder, 3 / 192), resolution, keep_thin_parts=True) for resolution in (4, 192)]
+    if kind == "spans":
+        # Blocks of four cells, each of one of two materials, at which springs of a kind end.
+        blocks = np.random.default_rng(0).integers(0, 2, (24, 24, 24))
+        np.savez(folder / "blocks.npz", cells=blocks, origin=[-0.5] * 3, cell_size=1 / 24)
+        solid["bodies"][0]["regions"] = [{"grid": str(folder / "blocks.npz"), "material": "stiff"}]
+    return [small, solid]
+
+
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux to measure memory")
+@pytest.mark.parametrize("kind", ["packages", "particles", "spans", "points", "triangles"])
+def test_memory_is_estimated(tmp_path: Path, kind: str) -> None:
+    """Plan what memory a scene takes, and how much more another one does, within 15 %.
+
+    Repeated, the same difference was measured 4 % more or less, as allocators keep what is freed; numbers of spans and
+    points are estimates themselves, which left up to 9 %. What a kind is about is more than a quarter of its
+    difference, so that nothing can be left out; but the spans of the law "young" are too few of any to be told apart.
+    """
+    runs = []
+    for number, scene in enumerate(make_pair(tmp_path, kind)):
+        command = [sys.executable, "-c", RUN, json.dumps(scene), str(tmp_path / f"run{number}")]
+        done = subprocess.run(command, capture_output=True, text=True, check=True)
+        runs.append([int(text) for text in done.stdout.split()])
+    planned, measured = (large - small for small, large in zip(*runs, strict=True))
+    assert planned == pytest.approx(measured, rel=0.15)
+    assert runs[0][0] == pytest.approx(runs[0][1], rel=0.15)
+
+
+def test_a_body_that_cannot_fit_is_refused_before_it_is_made(tmp_path: Path, monkeypatch) -> None:
+    """Refuse by numbers what needs more than there is: a solid before it is voxelised, a shell when it is counted."""
+    monkeypatch.setattr(plan, "memory_limit", lambda: 4e9)
+    box = tmp_path / "box.ply"
+    trimesh.creation.box().export(box)
+    with pytest.raises(SceneError, match=r"about 8,589,934,592 voxels at resolution 2,048 need about 515.\d GB .* 4.0"):
+        plan_scene(Scene.model_validate(make_model(box, 2048)))
+    with pytest.raises(SceneError, match=r"particles and [0-9,]+ springs need about [45].\d GB of memory, of 4.0 GB"):
+        plan_scene(Scene.model_validate(make_model(make_shell(tmp_path, 3 / 704), 704)))
+    assert 0.5e9 < plan_scene(Scene.model_validate(make_model(tmp_path / "shell.ply", 256))).memory_bytes < 1.2e9
