@@ -18,8 +18,9 @@ from world_files import WORLDS
 
 import warpjelly as wj
 from warpjelly import cli, plan
-from warpjelly.meshes import EXTENSIONS, EXTRA_EXTENSIONS
+from warpjelly.meshes import EXTENSIONS, EXTRA_EXTENSIONS, load_mesh
 from warpjelly.scene import Scene
+from warpjelly.validate import stage_problems
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CUBE = str(SCENES / "jello_cube.toml")
@@ -446,6 +447,24 @@ def test_voxelize_says_what_a_model_becomes(warpjelly, tmp_path):
     assert f"voxels     {figures['voxels']:>13,} of 8 x 12 x 8, 0.08333 m each" in out
 
 
+def test_voxelize_makes_a_stage_of_the_voxels(warpjelly, tmp_path):
+    """Write the voxels as a sound stage, with a face for each that has no neighbour."""
+    stage = tmp_path / "voxels.usdc"
+    code, out, err = warpjelly("voxelize", TREE, "-n", 12, "-o", stage)
+    assert (code, err) == (0, "")
+    assert f"stage: {stage}" in out
+    assert stage_problems(stage) == []
+    opened = Usd.Stage.Open(str(stage))
+    mesh = UsdGeom.Mesh(opened.GetPrimAtPath("/World/bodies/model/surface"))
+    counts, points = mesh.GetFaceVertexCountsAttr().Get(), np.array(mesh.GetPointsAttr().Get())
+    assert set(counts) == {4}
+    assert warpjelly("voxelize", TREE, "-n", 12, "-o", stage)[0] == 2
+    # All faces are squares of an edge of a twelfth, and shaped like the model, which lies on cell boundaries.
+    quads = points[np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 4)]
+    np.testing.assert_allclose(np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1), 1 / 12, rtol=1e-5)
+    assert len(quads) / 144 == pytest.approx(load_mesh(TREE).area, rel=1e-4)
+
+
 def test_voxelize_looks_below_a_prim(warpjelly, tmp_path):
     """Voxelize the body of a stage without the ground it lies on."""
     assert warpjelly("run", CUBE, "--frames", 1, "-o", tmp_path)[0] == 0
@@ -458,7 +477,7 @@ def test_voxelize_looks_below_a_prim(warpjelly, tmp_path):
     ("arguments", "said"),
     [
         (["nothing.obj", "-n", 4], "nothing.obj: no such file"),
-        ([TREE, "-n", 4, "-o", "grid.obj"], "grid.obj: a grid is written as .npz"),
+        ([TREE, "-n", 4, "-o", "grid.obj"], "grid.obj: a grid is written as .npz, a stage of the voxels as .usdc"),
         ([TREE, "-n", 0], "--resolution"),
         ([TREE, "-n", 4, "-o", "nowhere/grid.npz"], "nowhere/grid.npz: cannot write the grid"),
     ],

@@ -17,12 +17,13 @@ from warpjelly.cells import Cells
 from warpjelly.colors import KIND_COLORS
 from warpjelly.embedding import containing_cells, embed, face_cells
 from warpjelly.lattice import Lattice, build_lattice
+from warpjelly.plan import plan_scene
 from warpjelly.polygons import Part, from_polygons
 from warpjelly.preview import render_preview
 from warpjelly.run import simulate
 from warpjelly.scene import Output
 from warpjelly.shading import shared_normals
-from warpjelly.shapes import Shape, shapes_of
+from warpjelly.shapes import Shape, at_rest, shapes_of
 from warpjelly.simulator import Simulator
 from warpjelly.usd import open_stage
 from warpjelly.validate import stage_problems
@@ -174,6 +175,24 @@ def test_smooth_surfaces_of_cells_that_only_touch_stay_apart() -> None:
         sides = {bool(np.mean(lattice.particles[shape.particles[point]], axis=0)[0] < 1.0) for point in quad}
         assert len(sides) == 1
     assert ours.any()
+
+
+@pytest.mark.parametrize("surface", ["voxels", "smooth"])
+def test_a_shape_at_rest_is_what_a_simulator_shows_at_first(surface: str) -> None:
+    """Compare the sample in the body's frame with that of a simulator, for a body that is put nowhere else."""
+    layers = [["##.", "#.#"], ["#..", "#.#"]]
+    body = {"type": "voxels", "name": "body", "material": "jelly", "layers": layers}
+    show = ["surface", "springs", "particles"]
+    scene = make_scene(bodies=[body], output={"surface": surface, "show": show})
+    (plan,) = plan_scene(scene).bodies
+    lattice = plan.build()
+    shapes = shapes_of("body", lattice, scene.output)
+    assert [shape.name for shape in shapes] == show
+    for shape, sample in zip(shapes, Simulator(scene, device="cpu").shapes(), strict=True):
+        rest = at_rest(shape, lattice)
+        # Coordinates below 0.2 m, in float32, and normals from differences of such, 0.1 m apart.
+        np.testing.assert_allclose(rest.points, sample.points, rtol=0, atol=1e-7)
+        np.testing.assert_allclose(rest.normals, sample.normals, rtol=0, atol=1e-5)
 
 
 def test_faces_know_their_cells() -> None:

@@ -172,7 +172,12 @@ def voxelize(
     ],
     output: Annotated[
         Path | None,
-        typer.Option("-o", "--output", help="Grid to write, .npz, for `file` of a body of voxels.", show_default=False),
+        typer.Option(
+            "-o",
+            "--output",
+            help="Grid to write, .npz, for `file` of a body of voxels; or stage to look at, .usdc.",
+            show_default=False,
+        ),
     ] = None,
     prim: Annotated[
         str | None, typer.Option(help="Of a USD file, the prim below which to look.", show_default=False)
@@ -194,14 +199,15 @@ def voxelize(
     Start with -n 20 and go up until nothing that matters is lost: twice the resolution is eight times the voxels. What
     is printed here is what a scene gets from a body of type "model" with the same keys.
 
-    With -o FILE.npz the grid is kept, for a body with type = "voxels" and file = "FILE.npz".
+    With -o FILE.npz the grid is kept, for a body with type = "voxels" and file = "FILE.npz". With -o FILE.usdc the
+    voxels become a stage, for any USD viewer or `warpjelly preview`.
     """
     from .files import missing, refuse_to_replace
 
     if why := missing(model):
         raise InputError(f"{model}: {why}")
-    if output is not None and output.suffix.lower() != ".npz":
-        raise InputError(f"{output}: a grid is written as .npz")
+    if output is not None and output.suffix.lower() not in (".npz", ".usdc"):
+        raise InputError(f"{output}: a grid is written as .npz, a stage of the voxels as .usdc")
     if output is not None:
         refuse_to_replace(output, force=force)
 
@@ -213,11 +219,17 @@ def voxelize(
         options["prim"] = prim
     body = {"type": "model", "name": "model", "material": "jelly", "file": str(model.absolute()), **options}
     scene = read_scene({"materials": {"jelly": {}}, "bodies": [{**body, "resolution": resolution}]}, model)
-    grid, figures = survey_model(scene)
-    if output is not None:
+    grid, lattice, figures = survey_model(scene)
+    if output is not None and output.suffix.lower() == ".npz":
         from .gridfile import write_grid
 
         write_grid(output, grid.cells, grid.origin, grid.cell_size)
+    elif output is not None:
+        from .shapes import at_rest, shapes_of
+        from .usd import write_still
+
+        shapes = shapes_of("model", lattice, scene.output)
+        write_still(output, scene=scene, shapes=shapes, rest=[at_rest(shape, lattice) for shape in shapes])
     if as_json:
         print(json.dumps(figures))
         return
@@ -232,7 +244,7 @@ def voxelize(
     print(f"  springs    {figures['springs']:>13,}")
     print(f"  volume     {figures['volume']:>13.4g} m^3{share}")
     if output is not None:
-        print(f"grid: {output}")
+        print(f"{'grid' if output.suffix.lower() == '.npz' else 'stage'}: {output}")
 
 
 @app.command()

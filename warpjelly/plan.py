@@ -357,8 +357,8 @@ def _count_crossings(mesh: trimesh.Trimesh, body: ModelBody) -> float:
     return float(seen.sum() if votes else seen[2])
 
 
-def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
-    """Return the grid of a scene's only body, a model, and what becomes of it by name; SI units.
+def survey_model(scene: Scene) -> tuple[VoxelGrid, Lattice, dict[str, Any]]:
+    """Return the grid and the lattice of a scene's only body, a model, and what becomes of it by name; SI units.
 
     Raises:
         InputError: the model cannot be used.
@@ -371,17 +371,21 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, dict[str, Any]]:
     needed = BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * particles + BYTES_PER_BUILT_SPAN * spans
     _require_memory(needed, f"{grid.cells.count:,} voxels, {particles:,} particles and {springs:,} springs")
     lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
-    return grid, {
-        "voxels": grid.cells.count,
-        "particles": len(lattice.particles),
-        "springs": lattice.spring_count,
-        "pieces": len(grid.piece_sizes),
-        "watertight": voxelized.watertight,
-        "method": grid.method,
-        "volume": grid.volume,
-        "mesh_volume": voxelized.mesh_volume,
-        "warnings": voxelized.warnings,
-    }
+    return (
+        grid,
+        lattice,
+        {
+            "voxels": grid.cells.count,
+            "particles": len(lattice.particles),
+            "springs": lattice.spring_count,
+            "pieces": len(grid.piece_sizes),
+            "watertight": voxelized.watertight,
+            "method": grid.method,
+            "volume": grid.volume,
+            "mesh_volume": voxelized.mesh_volume,
+            "warnings": voxelized.warnings,
+        },
+    )
 
 
 def _require_memory(needed: float, what: str) -> None:

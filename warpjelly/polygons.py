@@ -150,14 +150,27 @@ def _sound_normals(part: Part, normals: np.ndarray) -> np.ndarray:
     normals = unit(normals)
     missing = ~normals.any(axis=1)
     if missing.any():
-        starts = np.cumsum(part.counts) - part.counts
-        points = part.vertices[part.corners]
-        arms = points - np.repeat(points[starts], part.counts, axis=0)
-        turns = np.cross(arms[:-1], arms[1:])
-        # What turns from the last corner of a polygon to the first one of the next is 0, whose arm is.
-        planes = np.add.reduceat(np.concatenate([turns, np.zeros((1, 3))]), starts)
+        planes = area_vectors(part.vertices, part.counts, part.corners)
         normals[missing] = np.repeat(unit(planes), part.counts, axis=0)[missing]
     return normals
+
+
+def area_vectors(points: np.ndarray, counts: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Return the normals of polygons, twice as long as they are large, [polygon_count, 3].
+
+    Args:
+        points: [point_count, 3].
+        counts: number of corners of each polygon, at least 3.
+        corners: point at each corner, polygon after polygon, counterclockwise from outside.
+    """
+    if not len(counts):
+        return np.zeros((0, 3))
+    starts = np.cumsum(counts) - counts
+    at = points[corners]
+    arms = at - np.repeat(at[starts], counts, axis=0)
+    turns = np.cross(arms[:-1], arms[1:])
+    # What turns from the last corner of a polygon to the first one of the next is 0, whose arm is.
+    return np.add.reduceat(np.concatenate([turns, np.zeros((1, 3))]), starts)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .polygons import Part, unit
+from .polygons import Part, area_vectors, unit
 
 # Faces that meet at a smaller angle than this, degrees, are one smooth surface, where a model has no normals.
 CREASE_ANGLE = 40.0
@@ -30,7 +30,7 @@ def shared_normals(part: Part) -> np.ndarray:
     same = (edges[order[1:]] == edges[order[:-1]]).all(axis=1)
     first, second = order[:-1][same], order[1:][same]
     face = np.repeat(np.arange(len(part.counts)), part.counts)
-    outward = _outward(part)
+    outward = unit(area_vectors(part.vertices, part.counts, part.corners))
     flat = np.einsum("ij,ij->i", outward[face[first]], outward[face[second]]) > np.cos(np.radians(CREASE_ANGLE))
     # Neighbours pass along their edge in opposite directions.
     joined = flat & (place[first] == place[following[second]]) & (place[first] != place[second])
@@ -46,13 +46,6 @@ def _following(part: Part) -> np.ndarray:
     ends = np.cumsum(part.counts)
     following[ends - 1] = ends - part.counts
     return following
-
-
-def _outward(part: Part) -> np.ndarray:
-    """Return the normal of each polygon, float64 [polygon_count, 3], of unit length or zero."""
-    starts = np.cumsum(part.counts) - part.counts
-    at = part.vertices[part.corners] - np.repeat(part.vertices[part.corners[starts]], part.counts, axis=0)
-    return unit(np.add.reduceat(np.cross(at, at[_following(part)]), starts, axis=0))
 
 
 def _components(count: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:

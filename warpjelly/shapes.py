@@ -9,6 +9,7 @@ import numpy as np
 
 from .embedding import containing_cells, embed, face_cells
 from .lattice import Lattice
+from .polygons import area_vectors, unit
 from .shading import shared_normals
 
 if TYPE_CHECKING:
@@ -100,6 +101,20 @@ def shapes_of(body: str, lattice: Lattice, output: Output, model: LoadedModel | 
         everyone = np.arange(len(lattice.particles), dtype=np.int32)
         shapes.append(Shape(body, PARTICLES, *_alone(everyone), width=_PARTICLE_WIDTH * _spring_length(lattice)))
     return shapes
+
+
+def at_rest(shape: Shape, lattice: Lattice) -> ShapeFrame:
+    """Return the sample of a shape in the frame of its body at rest, with no velocities and forces."""
+    points = np.einsum("pk,pkc->pc", shape.weights.astype(float), lattice.particles[shape.particles])
+    areas = np.repeat(area_vectors(points, shape.counts, shape.corners), shape.counts, axis=0)
+    normals = np.zeros((shape.normal_count, 3))
+    np.add.at(normals, shape.corners if shape.corner_normals is None else shape.corner_normals, areas)
+    return ShapeFrame(
+        points=points.astype(np.float32),
+        normals=unit(normals).astype(np.float32),
+        velocities=np.zeros(points.shape, np.float32),
+        forces=np.zeros(len(points), np.float32),
+    )
 
 
 def _alone(particles: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

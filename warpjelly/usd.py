@@ -161,6 +161,17 @@ class StageWriter:
             self._layer.SetTimeSample(path, index, Vt.IntArray.FromNumpy(indices))
 
 
+def write_still(path: Path, *, scene: Scene, shapes: Sequence[Shape], rest: Sequence[ShapeFrame]) -> None:
+    """Write shapes that do not move as a stage of one frame; the arguments are those of ``StageWriter``.
+
+    Raises:
+        EnvironmentFailedError: the file cannot be written.
+    """
+    writer = StageWriter(path, scene=scene, shapes=shapes, rest=rest, provenance={})
+    writer.write_frame(0, rest)
+    writer.close()
+
+
 def open_stage(source: Path) -> Usd.Stage:
     """Open a stage file, or the stage of a run directory.
 
