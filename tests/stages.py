@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
 
 from warpjelly.scene import Scene
 from warpjelly.shapes import SURFACE, Shape, ShapeFrame
-from warpjelly.usd import StageWriter
+from warpjelly.stagefiles import STAGE_NAME
+from warpjelly.stagewriter import StageWriter
 
 
 @dataclass(frozen=True)
@@ -89,11 +91,11 @@ def make_scene(**changes: Any) -> Scene:
 
 
 def start_stage(
-    path: Path, meshes: Sequence[Surface], scene: Scene | None = None, provenance: Mapping[str, object] | None = None
+    folder: Path, meshes: Sequence[Surface], scene: Scene | None = None, provenance: Mapping[str, object] | None = None
 ) -> StageWriter:
-    """Return a writer for a stage of surfaces."""
+    """Return a writer for a stage of surfaces in a run directory."""
     return StageWriter(
-        path,
+        folder,
         scene=scene or make_scene(),
         shapes=[mesh.shape for mesh in meshes],
         rest=[mesh.rest for mesh in meshes],
@@ -106,8 +108,10 @@ def write_stage(path: Path, scene: Scene | None = None, frames: int = 10, meshes
     scene = scene or make_scene()
     center = (0.0, 0.5, 0.0) if scene.up_axis == "Y" else (0.0, 0.0, 0.5)
     meshes = meshes or [cube_surface(center=center)]
-    writer = start_stage(path, meshes, scene, {"version": "0", "scene": {"name": scene.name}})
-    for frame in range(frames):
-        writer.write_frame(frame, [moved_surface(mesh, frame, scene.up) for mesh in meshes])
-    writer.close()
+    with TemporaryDirectory(dir=path.parent) as folder:
+        writer = start_stage(Path(folder), meshes, scene, {"version": "0", "scene": {"name": scene.name}})
+        for frame in range(frames):
+            writer.write_frame(frame, [moved_surface(mesh, frame, scene.up) for mesh in meshes])
+        writer.finish()
+        (Path(folder) / STAGE_NAME).replace(path)
     return path

@@ -22,7 +22,7 @@ from warpjelly.plan import plan_scene
 from warpjelly.run import simulate
 from warpjelly.scene import Material
 from warpjelly.simulator import Simulator
-from warpjelly.usd import open_stage
+from warpjelly.stagefiles import open_stage
 from warpjelly.validate import stage_problems
 
 YOUNG = {"law": "young", "youngs_modulus": 2e4, "density": 500.0}

@@ -118,11 +118,11 @@ def test_frames_stand_side_by_side(tmp_path: Path) -> None:
 def test_hardest_impact_is_the_default(tmp_path: Path, color: str) -> None:
     """Show the frame with the greatest forces unless told otherwise."""
     mesh = cube_surface()
-    writer = start_stage(tmp_path / "stage.usdc", [mesh], make_scene(output={"color": color}))
+    writer = start_stage(tmp_path, [mesh], make_scene(output={"color": color}))
     for frame, force in enumerate((1.0, 2.0, 5.0, 2.0, 3.0)):
         forces = np.full(len(mesh.points), force, dtype=np.float32)
         writer.write_frame(frame, [replace(moved_surface(mesh, frame), forces=forces)])
-    writer.close()
+    writer.finish()
     render_preview(tmp_path, tmp_path / "default.png", size=SIZE)
     render_preview(tmp_path, tmp_path / "hardest.png", frames=[2], size=SIZE)
     np.testing.assert_array_equal(pixels(tmp_path / "default.png"), pixels(tmp_path / "hardest.png"))
@@ -206,5 +206,5 @@ def test_wrong_arguments_are_explained(
 
 def test_missing_stage_is_explained(tmp_path: Path) -> None:
     """Refuse a directory without a stage."""
-    with pytest.raises(InputError, match=r"no stage\.usdc in this directory"):
+    with pytest.raises(InputError, match=r"no stage\.usdc or stage\.usda in this directory"):
         render_preview(tmp_path, tmp_path / "p.png")

@@ -25,7 +25,7 @@ from warpjelly.scene import Output
 from warpjelly.shading import shared_normals
 from warpjelly.shapes import Shape, at_rest, shapes_of
 from warpjelly.simulator import Simulator
-from warpjelly.usd import open_stage
+from warpjelly.stagefiles import open_stage
 from warpjelly.validate import stage_problems
 
 ORIGIN, CELL = np.array([-1.0, 0.5, 2.0]), 0.25

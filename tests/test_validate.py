@@ -192,7 +192,7 @@ def test_a_damaged_stage_is_not_sound(tmp_path: Path) -> None:
     """Flip bytes in the middle of a crate file, and find it damaged instead of failing."""
     path = write_stage(tmp_path / "stage.usdc")
     data = bytearray(path.read_bytes())
-    for position in range(len(data) // 4, len(data) // 2, 7):
+    for position in range(len(data) // 2, 3 * len(data) // 4, 7):
         data[position] ^= 0xFF
     path.write_bytes(data)
     assert stage_problems(path)

@@ -73,6 +73,10 @@ def run(
         int | None, typer.Option(min=1, help="Number of samples instead of the scene's.", show_default=False)
     ] = None,
     settings: SetOption = [],  # noqa: B006 -- typer wants a list and copies it
+    resume: Annotated[
+        bool,
+        typer.Option("--resume", help="Go on with a run that was interrupted or killed, or now has more --frames."),
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a run that is there already.")] = False,
     color: Annotated[
         Literal["indexed", "rgb"] | None,
@@ -84,7 +88,8 @@ def run(
     """Simulate a scene and write its stage.
 
     The run directory receives stage.usdc, metrics.csv (energies, momenta, contacts per frame) and run.json (all that is
-    needed to repeat the run).
+    needed to repeat the run). While the run is going, stage.usda beside its parts has the frames so far. Ctrl-C ends it
+    after the current frame; with --resume it goes on, and ends as if it had never stopped.
     """
     overrides = _overrides(settings)
     if color is not None:
@@ -119,7 +124,7 @@ def run(
 
         ended = None
         try:
-            result = simulate(loaded, output=output, device=device, force=force, progress=show)
+            result = simulate(loaded, output=output, device=device, force=force, resume=resume, progress=show)
         except RunEndedError as error:
             ended, result = error, error.run
     if as_json:
@@ -226,7 +231,7 @@ def voxelize(
         write_grid(output, grid.cells, grid.origin, grid.cell_size)
     elif output is not None:
         from .shapes import at_rest, shapes_of
-        from .usd import write_still
+        from .stagewriter import write_still
 
         shapes = shapes_of("model", lattice, scene.output)
         write_still(output, scene=scene, shapes=shapes, rest=[at_rest(shape, lattice) for shape in shapes])
@@ -249,15 +254,21 @@ def voxelize(
 
 @app.command()
 def validate(
-    stage: Annotated[Path, typer.Argument(help="Stage file or run directory.", show_default=False)],
+    stage: Annotated[Path, typer.Argument(metavar="RUN_OR_STAGE", help="Run directory or stage.", show_default=False)],
 ) -> None:
-    """Say whether a stage is sound: exit 0, or 1 with every problem listed."""
+    """Say whether a stage is sound: exit 0, or 1 with every problem listed.
+
+    The stage of a run that was killed or interrupted is as sound as any, but said not to be finished.
+    """
+    from .stagefiles import open_stage, progress
     from .validate import stage_problems
 
     problems = stage_problems(stage)
     for problem in problems:
         print(problem)
-    print(f"{stage}: {'sound' if not problems else f'{len(problems)} problem(s)'}")
+    unfinished = progress(open_stage(stage))
+    note = f"; the run is not finished: {unfinished[0]} of {unfinished[1]} frames" if unfinished else ""
+    print(f"{stage}: {'sound' if not problems else f'{len(problems)} problem(s)'}{note}")
     if problems:
         raise typer.Exit(1)
 

@@ -5,6 +5,8 @@ The vocabulary is documented with the fields of ``scene.Expect``; here is how ea
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import TYPE_CHECKING
 
@@ -12,6 +14,9 @@ import numpy as np
 
 if TYPE_CHECKING:
     from .simulator import Simulator
+
+
+log = logging.getLogger("warpjelly")
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,25 @@ class Observer:
         self._centers.append(np.array([self._mass[part] @ x[part] / self._mass[part].sum() for part in parts]))
         self._heights.append(np.array([np.ptp(x[part, up]) for part in parts]))
         self._depths.append(penetrations)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of what was observed, for a checkpoint after the current frame."""
+        return {
+            "centers": np.array(self._centers),
+            "heights": np.array(self._heights),
+            "depths": np.array(self._depths),
+        }
+
+    def restore(self, arrays: Mapping[str, np.ndarray], frame_count: int) -> None:
+        """Go on after so many frames from what another observer took in, with the simulator where it was then."""
+        if not self._expectations:
+            return
+        if len(arrays["centers"]) != frame_count:
+            log.warning("what the scene expects is not measured: earlier frames were simulated without expectations")
+            self._expectations = []
+            return
+        self._positions, self._velocities = self._sim.positions, self._sim.velocities
+        self._centers, self._heights, self._depths = (list(arrays[name]) for name in ("centers", "heights", "depths"))
 
     def outcomes(self) -> list[Outcome]:
         """Return the quantities that the scene bounds, at the last frame that was observed."""

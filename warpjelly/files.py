@@ -1,13 +1,16 @@
-"""Write files that are there whole or not at all."""
+"""Write files that are there whole or not at all, and folders that one process at a time writes to."""
 
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from .errors import InputError
+
+LOCK_NAME = "run.lock"
 
 
 def refuse_to_replace(path: Path, *, force: bool) -> None:
@@ -30,7 +33,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     The name keeps the extension, from which writers tell the format. The data is on the disk before the file is
     renamed, so that even a power loss leaves either the old file or the new one. After an exception nothing is left.
     """
-    unfinished = path.with_name(f"{path.stem}.tmp{path.suffix}")
+    unfinished = unfinished_name(path)
     try:
         yield unfinished
         with unfinished.open("rb") as file:
@@ -39,3 +42,42 @@ def whole_file(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def unfinished_name(path: Path) -> Path:
+    """Return the name that a whole file has until it is whole."""
+    return path.with_name(f"{path.stem}.tmp{path.suffix}")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Keep other processes that ask for it out of a folder. The lock ends with its process, however that ends.
+
+    Raises:
+        InputError: another process has the lock.
+        OSError: the folder cannot be written to.
+    """
+    if sys.platform == "win32":
+        yield
+        return
+    import fcntl
+
+    path = folder / LOCK_NAME
+    with ExitStack() as opened:
+        while True:
+            file = opened.enter_context(open(path, "a+", encoding="ascii"))
+            try:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                file.seek(0)
+                raise InputError(f"{folder}: process {file.read() or '?'} is writing a run into this folder") from error
+            # Whoever had the lock before may just have removed the file, and a third process have made another one.
+            if path.exists() and os.stat(path).st_ino == os.fstat(file.fileno()).st_ino:
+                break
+        file.truncate(0)
+        file.write(str(os.getpid()))
+        file.flush()
+        try:
+            yield
+        finally:
+            path.unlink(missing_ok=True)

@@ -55,9 +55,12 @@ YOUNG_SPANS = 2
 BYTES_PER_BUILT_PARTICLE, BYTES_PER_BUILT_SPAN = 60, 40
 # Resolutions to try where a model has no voxel; the last ones take a second.
 _FINER = [2**k for k in range(2, 11)]
-# Making what is shown; then points, normals, colours and forces of a point at a frame, all of which are in memory until
-# the stage is whole.
+# Making what is shown; then point, normal, colour and force of a point at a frame.
 BYTES_PER_POINT, BYTES_PER_SAMPLE = 145, 36
+# A clip of the stage has at most so many frames, and bytes. It is what memory holds, and what a sudden end of the
+# process costs; for each clip the disk has to confirm four files, which takes some 10 ms each.
+CLIP_FRAMES = 24
+CLIP_BYTES = 64_000_000
 # Splitting a surface by directions makes patches of the faces of jelly cubes, wider by so many points than by faces.
 _PATCH_MARGIN = 0.6
 # Reading a model needs packages, and the mesh itself.
@@ -119,7 +122,8 @@ class Plan:
     def body_bytes(self) -> dict[str, int]:
         """Estimated share of each body in the peak of memory, bytes by name."""
         per_particle = BYTES_PER_PARTICLE[self.scene.solver.precision]
-        per_point = BYTES_PER_POINT + BYTES_PER_SAMPLE * self.scene.frame_count
+        frames = min(self.scene.frame_count, clip_length(sum(plan.point_estimate for plan in self.bodies)))
+        per_point = BYTES_PER_POINT + BYTES_PER_SAMPLE * frames
         return {
             plan.body.name or "": per_particle * plan.particle_count
             + BYTES_PER_SPAN * plan.span_estimate
@@ -133,6 +137,11 @@ class Plan:
         """Estimated peak of memory, bytes."""
         models = any(plan.triangle_count for plan in self.bodies)
         return int(BYTES_AT_REST + models * BYTES_OF_MODELS + sum(self.body_bytes.values()))
+
+
+def clip_length(point_count: int) -> int:
+    """Return how many frames of so many points make a clip of the stage."""
+    return max(1, min(CLIP_FRAMES, CLIP_BYTES // (BYTES_PER_SAMPLE * max(point_count, 1))))
 
 
 def plan_scene(scene: Scene) -> Plan:

@@ -16,7 +16,7 @@ from .colors import SRGB_TABLE, srgb_from_linear
 from .errors import EnvironmentFailedError, InputError
 from .files import whole_file
 from .solids import Drawn, draw_stage, shapes_in
-from .usd import open_stage
+from .stagefiles import open_stage
 from .validate import stage_problems
 
 if TYPE_CHECKING:

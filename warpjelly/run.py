@@ -2,35 +2,52 @@
 
 from __future__ import annotations
 
-import csv
-import json
 import logging
 import platform
+import signal
+import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from types import FrameType
 from typing import Any
 
 import numpy as np
 
 from warpjelly.kernels.integrators import STAGES
 
+from .background import Background
+from .checkpoint import Checkpoint, differences, origin_of, restore_state, scene_keys, state_arrays
 from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
 from .expect import Observer, Outcome
-from .files import whole_file
+from .files import locked
 from .plan import plan_scene
+from .rundir import (
+    CHECKPOINT_NAME,
+    RECORD_NAME,
+    Recorder,
+    find_checkpoint,
+    open_metrics,
+    read_record,
+    refuse_to_replace_run,
+    remove_leftovers,
+    write_record,
+)
 from .scene import Scene
 from .shapes import SURFACE, ShapeFrame
 from .simulator import Simulator
 from .stability import evaluations
+from .stagefiles import find_stage
+from .stagewriter import StageWriter
 from .starts import warn_of_deep_starts
-from .usd import STAGE_NAME, StageWriter
 
 log = logging.getLogger("warpjelly")
 
-RECORD_NAME, METRICS_NAME = "run.json", "metrics.csv"
+# Frames that were simulated and are not written yet: while one is written, the next but one may be simulated.
+FRAMES_IN_FLIGHT = 2
 # A run warns of a step above the limit where finding the limit takes at most this share of it, or at most as long as
 # evaluating the forces of so many springs once each, a second or less.
 LIMIT_SHARE = 0.02
@@ -64,6 +81,7 @@ def simulate(
     output: str | Path | None = None,
     device: str = "auto",
     force: bool = False,
+    resume: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> Run:
     """Simulate a scene and write its run directory.
@@ -73,82 +91,113 @@ def simulate(
         output: the run directory; ``outputs/<scene name>`` unless given.
         device: "auto", "cpu", "cuda:0" ...
         force: replace a run that is there already.
+        resume: go on with a run of this scene that is there already, however it ended, as if it had never ended; also
+            one that has finished, if the scene has more frames now. Without one, start.
         progress: called after each frame with the number of frames done and in all.
 
     Raises:
-        InputError: the scene cannot be built, or the directory holds a run and ``force`` is not set.
+        InputError: the scene cannot be built; the directory holds a run and neither ``force`` nor ``resume`` is set, or
+            one of another scene; or another process is writing to it.
         RunEndedError: the simulation diverged or was interrupted; the error has the run up to there.
         EnvironmentFailedError: the run directory cannot be written.
     """
     folder = Path(output) if output is not None else Path("outputs") / scene.name
     if folder.exists() and not folder.is_dir():
         raise EnvironmentFailedError(f"{folder}: cannot write the run: it is a file; choose a folder with -o")
-    if not force:
-        _refuse_to_replace(folder)
-    plan = plan_scene(scene)
-    sim = Simulator(plan, device=device)
-    warn_of_deep_starts(sim)
-    _warn_of_long_steps(sim)
+    if force and resume:
+        raise InputError("--resume goes on with a run, --force replaces it: give one of them")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        # Without its record a run does not count as finished. The old stage stays until the new one is whole.
-        (folder / RECORD_NAME).unlink(missing_ok=True)
-        with open(folder / METRICS_NAME, "w", newline="", encoding="utf-8") as metrics:
-            return _simulate_into(folder, sim, csv.writer(metrics), progress)
+        with ExitStack() as held:
+            if existed := folder.is_dir():
+                held.enter_context(locked(folder))
+            checkpoint = find_checkpoint(folder, scene) if resume else None
+            if checkpoint is not None and (run := _finished_run(folder, scene)):
+                return run
+            if checkpoint is not None and checkpoint.frame_count == 0:
+                checkpoint = None
+            if not (force or resume):
+                refuse_to_replace_run(folder)
+            sim = Simulator(plan_scene(scene), device=device)
+            warn_of_deep_starts(sim)
+            _warn_of_long_steps(sim)
+            if not existed:
+                folder.mkdir(parents=True, exist_ok=True)
+                held.enter_context(locked(folder))
+                # Another process may have come first.
+                refuse_to_replace_run(folder)
+            return _simulate_into(folder, sim, checkpoint, progress)
     except OSError as error:
         raise EnvironmentFailedError(f"{folder}: cannot write the run: {error.strerror or error}") from error
 
 
-def _refuse_to_replace(folder: Path) -> None:
-    """Raise InputError where a folder holds a run."""
-    found = [name for name in (RECORD_NAME, STAGE_NAME, METRICS_NAME) if (folder / name).exists()]
-    if found:
-        what = "a run" if RECORD_NAME in found else "a run that did not finish"
-        raise InputError(
-            f"{folder}: holds {what} already ({', '.join(found)}); replace it with --force, or choose another folder "
-            "with -o"
-        )
+def _finished_run(folder: Path, scene: Scene) -> Run | None:
+    """Return what came of the run in a folder, if it needs no more frames.
+
+    Raises:
+        RunEndedError: it diverged.
+    """
+    if not (folder / RECORD_NAME).is_file():
+        return None
+    record = read_record(folder)
+    run = Run(record, [Outcome(**{k: v for k, v in entry.items() if k != "met"}) for entry in record["expect"]])
+    if record["diverged"]:
+        raise RunEndedError(f"{folder}: the run diverged after {record['frames']} frames", run, DivergedError.exit_code)
+    return run if record["frames"] >= scene.frame_count and not record["interrupted"] else None
 
 
-def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callable[[int, int], None]) -> Run:
-    scene, total = sim.scene, sim.scene.frame_count
-    shapes, rest = sim.model.shapes, sim.shapes()
-    writer = StageWriter(folder / STAGE_NAME, scene=scene, shapes=shapes, rest=rest, provenance=provenance(scene, sim))
+def _simulate_into(
+    folder: Path, sim: Simulator, checkpoint: Checkpoint | None, progress: Callable[[int, int], None]
+) -> Run:
+    """Simulate the frames that a run directory lacks."""
+    scene, rest = sim.scene, sim.shapes()
+    keys, origin = scene_keys(scene), origin_of(sim.device)
+    if checkpoint is not None and (changed := differences(checkpoint.origin, origin)):
+        log.warning("%s: from here on, last bits may differ: %s", folder, "; ".join(changed))
     observer = Observer(sim)
-    sim.prepare()
-    stepping, frames = 0.0, 0
-    ended: DivergedError | KeyboardInterrupt | None = None
-    began = time.perf_counter()
-    try:
-        for index in range(total):
-            if index > 0:
-                before = time.perf_counter()
-                sim.advance_frame()
-                stepping += time.perf_counter() - before
-            figures = sim.diagnostics()
-            row = _metrics_row(index, sim.time, figures)
-            if index == 0:
-                metrics.writerow(row)
-            metrics.writerow(row.values())
-            observer.observe(figures["penetrations"])
-            writer.write_frame(index, sim.shapes())
-            frames = index + 1
-            progress(frames, total)
-    except (DivergedError, KeyboardInterrupt) as error:
-        ended = error
-    finally:
-        # Whatever happens, also what nobody foresaw: the frames that were finished are saved.
-        writer.close()
+    done = 0 if checkpoint is None else checkpoint.frame_count
+    if checkpoint is not None:
+        restore_state(sim, checkpoint.part("state"))
+        observer.restore(checkpoint.part("observer"), done)
+    # Without its record a run does not count as finished.
+    (folder / RECORD_NAME).unlink(missing_ok=True)
+    remove_leftovers(folder)
+    if checkpoint is None:
+        Checkpoint(0, keys, origin, {}).save(folder / CHECKPOINT_NAME)
+    with closing(open_metrics(folder, done)) as metrics:
+        writer = StageWriter(
+            folder,
+            scene=scene,
+            shapes=sim.model.shapes,
+            rest=rest,
+            provenance=provenance(scene, sim),
+            resume=None if checkpoint is None else checkpoint.part("stage"),
+        )
+        recorder = Recorder(folder, writer, metrics, scene=keys, origin=origin)
+        sim.prepare()
+        began, ended = time.perf_counter(), None
+        try:
+            stepping, ended = _simulate_frames(sim, observer, writer, recorder, progress)
+            if not isinstance(ended, KeyboardInterrupt):
+                writer.finish()
+        except KeyboardInterrupt as error:
+            ended = error
+        except EnvironmentFailedError as error:
+            if not writer.saved_count:
+                raise
+            kept = f"{writer.saved_count} of {scene.frame_count} frames are kept; go on with --resume"
+            raise EnvironmentFailedError(f"{error}; {kept}") from error
     _warn_of_inside_out(rest, sim)
-    stages = len(STAGES.get(scene.solver.integrator, [None]))
-    forces = max(frames - 1, 0) * sim.substeps * stages
+    frames = writer.frame_count
     observer.diverged = isinstance(ended, DivergedError)
     outcomes = observer.outcomes()
+    stages = len(STAGES.get(scene.solver.integrator, [None]))
+    forces = max(frames - max(done, 1), 0) * sim.substeps * stages
     record = {
         "scene": scene.name,
-        "stage": str(folder / STAGE_NAME),
+        "stage": str(find_stage(folder)),
         "run_dir": str(folder),
         "frames": frames,
+        "resumed_from": done,
         "fps": scene.fps,
         "particles": sim.model.particle_count,
         "springs": sim.model.spring_count,
@@ -163,14 +212,84 @@ def _simulate_into(folder: Path, sim: Simulator, metrics: Any, progress: Callabl
         "expect": [outcome.as_dict() for outcome in outcomes],
         **provenance(scene, sim),
     }
-    with whole_file(folder / RECORD_NAME) as unfinished:
-        unfinished.write_text(json.dumps(record, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_record(folder, record)
     run = Run(record, outcomes)
     if isinstance(ended, DivergedError):
         raise RunEndedError(str(ended), run, ended.exit_code) from ended
     if ended is not None:
-        raise RunEndedError(f"interrupted after {frames} of {total} frames, which are in {folder}", run, 130) from ended
+        what = f"interrupted after {frames} of {scene.frame_count} frames, which are in {folder}; go on with --resume"
+        raise RunEndedError(what, run, 130) from ended
     return run
+
+
+def _simulate_frames(
+    sim: Simulator,
+    observer: Observer,
+    writer: StageWriter,
+    recorder: Recorder,
+    progress: Callable[[int, int], None],
+) -> tuple[float, DivergedError | KeyboardInterrupt | None]:
+    """Simulate the frames that are not written yet; however that ends, those that were finished are on the disk then.
+
+    Returns:
+        The time it took to step, s; and what ended the run before its last frame.
+    """
+    first, total = writer.frame_count, sim.scene.frame_count
+    stepping = 0.0
+    with Background(FRAMES_IN_FLIGHT) as background, _interruptions() as interrupted:
+        try:
+            for index in range(first, total):
+                if index > 0:
+                    before = time.perf_counter()
+                    sim.advance_frame()
+                    stepping += time.perf_counter() - before
+                figures = sim.diagnostics()
+                observer.observe(figures["penetrations"])
+                stopping = interrupted()
+                due = stopping or index + 1 == total or (index + 1 - first) % writer.clip_length == 0
+                changing = _changing_arrays(sim, observer) if due else None
+                row = _metrics_row(index, sim.time, figures)
+                background.submit(recorder.save, index, sim.shapes(), row, changing)
+                progress(index + 1, total)
+                if stopping and index + 1 < total:
+                    return stepping, KeyboardInterrupt()
+        except (DivergedError, KeyboardInterrupt) as error:
+            return stepping, error
+        finally:
+            background.join()
+            writer.flush()
+    return stepping, None
+
+
+def _changing_arrays(sim: Simulator, observer: Observer) -> dict[str, np.ndarray]:
+    """Return copies of all that a checkpoint needs besides the stage."""
+    parts = {"state": state_arrays(sim), "observer": observer.arrays()}
+    return {f"{owner}.{name}": array for owner, arrays in parts.items() for name, array in arrays.items()}
+
+
+@contextmanager
+def _interruptions() -> Iterator[Callable[[], bool]]:
+    """Give a function that says whether Ctrl-C was pressed, or the like; a second time it interrupts as ever."""
+    asked = threading.Event()
+
+    def ask(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        signal.signal(number, signal.default_int_handler)
+
+    ours = [number for number in (signal.SIGINT, signal.SIGTERM) if _interrupts(number)]
+    for number in ours:
+        signal.signal(number, ask)
+    try:
+        yield asked.is_set
+    finally:
+        for number in ours:
+            signal.signal(number, signal.default_int_handler)
+
+
+def _interrupts(number: int) -> bool:
+    """Say whether a signal raises KeyboardInterrupt here; only the main thread may change that."""
+    in_main = threading.current_thread() is threading.main_thread()
+    return in_main and signal.getsignal(number) is signal.default_int_handler
 
 
 def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:

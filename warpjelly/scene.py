@@ -798,6 +798,11 @@ class MagneticField(ForceField):
 class Output(Table):
     """What is written."""
 
+    format: Literal["usdc", "clips"] = Field(
+        "usdc",
+        description="what a finished run leaves: one self-contained stage.usdc; or stage.usda, geometry.usdc and the "
+        "frames in files below clips/, as while the run is going, which takes no time and no space at the end",
+    )
     surface: Literal["voxels", "smooth", "model"] = Field(
         "voxels",
         description="what the surface of a body of cells is: the faces of its cells, hard where their directions meet; "
@@ -822,6 +827,7 @@ class Output(Table):
         "indexed", description="indexed: a colour table and one small index per point; rgb: for readers without indices"
     )
     velocities: Switch = Field(False, description="write point velocities, for motion blur")
+    forces: Switch = Field(False, description="write the force on each point, N, as primvars:force")
 
     @field_validator("force_range")
     @classmethod

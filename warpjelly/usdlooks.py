@@ -9,6 +9,7 @@ from typing import Any
 
 from pxr import Ar, Gf, Sdf, Usd, UsdShade
 
+from .files import whole_file
 from .looks import Look, Placing, Texture, Value
 
 log = logging.getLogger("warpjelly")
@@ -85,7 +86,7 @@ def _texture(file: Path, output: Usd.Attribute, name: str, images: dict[str, byt
     space = _input(shader, "sourceColorSpace", "auto")
     wrap = (_input(shader, "wrapS", "useMetadata"), _input(shader, "wrapT", "useMetadata"))
     return Texture(
-        re.split(r"[/\\\[\]]", asset.path.rstrip("]"))[-1],
+        asset_name(asset.path),
         images[path],
         UsdShade.Output(output).GetBaseName(),
         space == "sRGB" or (space == "auto" and name in _COLORS),
@@ -148,7 +149,7 @@ def define_look(stage: Usd.Stage, path: Sdf.Path, look: Look, texture_folder: Pa
             continue
         image = value.of("rgb")
         if image not in shaders:
-            file = f"./{texture_folder.name}/{_written(texture_folder, image)}"
+            file = f"./{texture_folder.name}/{store_image(texture_folder, image.name, image.data)}"
             shaders[image] = _define_texture(material, f"{name}_texture", image, file)
         kind = Sdf.ValueTypeNames.Float3 if value.channel == "rgb" else Sdf.ValueTypeNames.Float
         shader_input.ConnectToSource(shaders[image].CreateOutput(value.channel, kind))
@@ -182,14 +183,26 @@ def _define_texture(material: UsdShade.Material, name: str, texture: Texture, fi
     return shader
 
 
-def _written(folder: Path, texture: Texture) -> str:
-    """Write an image into a folder, unless it is there, and return the name of its file."""
+def store_image(folder: Path, name: str, data: bytes) -> str:
+    """Write an image into a folder, which is made if missing, unless it is there; return the name of its file.
+
+    Args:
+        folder: where to.
+        name: that of the image, anything; the file gets one that is close to it and not taken.
+        data: the contents of the file.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for file in sorted(folder.iterdir()):
-        if file.is_file() and file.stat().st_size == len(texture.data) and file.read_bytes() == texture.data:
+        if file.is_file() and file.stat().st_size == len(data) and file.read_bytes() == data:
             return file.name
-    name = Path(re.sub(r"[^\w.-]+", "_", texture.name, flags=re.ASCII).lstrip(".") or "texture")
-    names = [name.name, *(f"{name.stem}_{k}{name.suffix}" for k in range(1, 1 + sum(1 for _ in folder.iterdir())))]
+    safe = Path(re.sub(r"[^\w.-]+", "_", name, flags=re.ASCII).lstrip(".") or "texture")
+    names = [safe.name, *(f"{safe.stem}_{k}{safe.suffix}" for k in range(1, 1 + sum(1 for _ in folder.iterdir())))]
     file = folder / next(one for one in names if not (folder / one).exists())
-    file.write_bytes(texture.data)
+    with whole_file(file) as unfinished:
+        unfinished.write_bytes(data)
     return file.name
+
+
+def asset_name(path: str) -> str:
+    """Return the name of the file that an asset path names, also of one in a package."""
+    return re.split(r"[/\\\[\]]", path.rstrip("]"))[-1]

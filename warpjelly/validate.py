@@ -9,7 +9,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
 
 from .errors import reason
-from .usd import open_stage
+from .stagefiles import open_stage
 
 # The newest crate version that common viewers open.
 MAX_CRATE_VERSION = (0, 8, 0)

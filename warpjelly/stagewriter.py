@@ -1,0 +1,320 @@
+"""How a stage gets to the disk: frame by frame, in a few files that are each whole or not there.
+
+While a run is going its stage consists of a small root, one layer with the rest pose, and clips of some frames each.
+The root is replaced after every clip. So what is on the disk can be opened at any moment and has only good samples, and
+memory holds no more than the frames of a clip.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+from pxr import Sdf, Usd
+
+from .errors import EnvironmentFailedError, InputError
+from .files import whole_file
+from .histogram import ForceHistogram
+from .pack import has_forces, join_clips, recolor_clip
+from .plan import clip_length
+from .prims import WORLD
+from .scene import Scene
+from .shapes import Shape, ShapeFrame
+from .stagefiles import (
+    CLIPS_NAME,
+    GEOMETRY_NAME,
+    MANIFEST_NAME,
+    ROOT_NAME,
+    STAGE_NAME,
+    TEXTURES_NAME,
+    active_clips,
+    clip_name,
+    export_layer,
+    open_stage,
+    remove_parts,
+    set_progress,
+)
+from .surroundings import define_camera, define_colliders
+from .usd import author_colors, author_sample, declare_samples, define_rest, legend, set_metadata
+
+log = logging.getLogger("warpjelly")
+
+
+class StageWriter:
+    """Writes the frames of a run into the stage of its directory."""
+
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        scene: Scene,
+        shapes: Sequence[Shape],
+        rest: Sequence[ShapeFrame],
+        provenance: Mapping[str, object],
+        resume: Mapping[str, np.ndarray] | None = None,
+    ) -> None:
+        """Start a stage that can be opened, with its rest pose, or go on with one.
+
+        A stage in one file that was there before stays until the new one is whole, unless it is gone on with.
+
+        Args:
+            folder: the run directory; it is made if missing.
+            scene: what is simulated.
+            shapes: what is shown.
+            rest: a sample of each, for applications that ask for no time.
+            provenance: where the result comes from; see ``usd.define_rest``.
+            resume: ``arrays()`` of the writer whose stage is gone on with, after its last complete clip.
+
+        Raises:
+            InputError: what is to be gone on with is not there.
+            EnvironmentFailedError: the folder cannot be made or written to.
+        """
+        self._folder = folder
+        self._scene = scene
+        self._shapes = list(shapes)
+        self._bounds = _bounds_of(rest)
+        self._rest_center = self._bounds.mean(axis=0)
+        self._forces = ForceHistogram()
+        self._fixed_range = None if scene.output.force_range == "auto" else scene.output.force_range
+        self._starts: list[int] = []
+        self._frame_count = 0
+        _require_writable(folder)
+        if resume is None:
+            remove_parts(folder)
+        else:
+            self._restore(resume)
+        self._clip_forces: list[list[np.ndarray]] = []
+        self._clip = self._new_clip()
+        self._write_rest(rest, provenance)
+        self._write_root(finished=False)
+
+    @property
+    def clip_length(self) -> int:
+        """Number of frames of a clip, after which to flush."""
+        return clip_length(sum(len(shape.particles) for shape in self._shapes))
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames that were written, those in memory included."""
+        return self._frame_count
+
+    @property
+    def saved_count(self) -> int:
+        """Number of frames that are on the disk."""
+        return self._frame_count - len(self._clip_forces)
+
+    def write_frame(self, index: int, samples: Sequence[ShapeFrame]) -> None:
+        """Add one sample to the clip in memory.
+
+        Args:
+            index: number of the frame and its time code; frames arrive in order.
+            samples: one for each shape, in the order of the shapes.
+        """
+        if index != self._frame_count:
+            raise ValueError(f"frame {index} written where frame {self._frame_count} is due")
+        for shape, sample in zip(self._shapes, samples, strict=True):
+            extent = author_sample(self._clip, index, shape, sample)
+            self._bounds[0] = np.minimum(self._bounds[0], extent[0])
+            self._bounds[1] = np.maximum(self._bounds[1], extent[1])
+        self._clip_forces.append([np.array(sample.forces, np.float32) for sample in samples])
+        self._frame_count += 1
+
+    def flush(self) -> None:
+        """Write the frames in memory as a clip, and then the root with it.
+
+        Raises:
+            EnvironmentFailedError: they cannot be written; the stage is as it was before.
+        """
+        if not self._clip_forces:
+            return
+        start = self.saved_count
+        if self._fixed_range is None:
+            for forces in self._clip_forces:
+                self._forces.add(np.concatenate(forces))
+        force_range = self._force_range()
+        for index, forces in enumerate(self._clip_forces, start):
+            for shape, own in zip(self._shapes, forces, strict=True):
+                author_colors(self._clip, index, shape, own, force_range)
+        self._clip.startTimeCode, self._clip.endTimeCode = start, self._frame_count - 1
+        export_layer(self._clip, self._folder / CLIPS_NAME / clip_name(start))
+        self._starts.append(start)
+        self._clip_forces.clear()
+        self._clip = self._new_clip()
+        self._write_root(finished=False)
+
+    def finish(self) -> None:
+        """Bring the stage into its final form: all colours by one range, and one file if the scene says so.
+
+        Raises:
+            EnvironmentFailedError: it cannot be written; the stage in parts is as good as before.
+        """
+        self.flush()
+        clips = [(start, self._folder / CLIPS_NAME / clip_name(start)) for start in self._starts]
+        if self._scene.output.format == "usdc":
+            whole = Sdf.Layer.OpenAsAnonymous(str(self._folder / GEOMETRY_NAME))
+            self._define_motion(Usd.Stage.Open(whole))
+            join_clips(whole, clips, self._force_range(), self._folder / STAGE_NAME)
+            remove_parts(self._folder)
+            return
+        for _, clip in clips:
+            recolor_clip(clip, self._force_range(), keep_forces=self._scene.output.forces)
+        self._write_root(finished=True)
+        # Of a run that was replaced.
+        (self._folder / STAGE_NAME).unlink(missing_ok=True)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return copies of what another writer needs besides the files to go on after the last clip."""
+        return {"frame_count": np.array(self.saved_count), "bounds": self._bounds.copy(), **self._forces.arrays()}
+
+    def _restore(self, arrays: Mapping[str, np.ndarray]) -> None:
+        """Go on after the last clip of another writer, even if its stage was brought into its final form."""
+        self._frame_count = int(arrays["frame_count"])
+        self._bounds = arrays["bounds"].copy()
+        self._forces.restore(arrays)
+        stage, folder = open_stage(self._folder), self._folder / CLIPS_NAME
+        if not (self._folder / ROOT_NAME).exists():
+            self._starts = [0]
+            folder.mkdir(exist_ok=True)
+            _link(self._folder / STAGE_NAME, folder / clip_name(0))
+        else:
+            # The root is written before a checkpoint, so it may have more clips.
+            self._starts = [start for start, _ in active_clips(stage) if start < self._frame_count]
+        for start in self._starts:
+            if not (folder / clip_name(start)).is_file():
+                raise InputError(
+                    f"{folder / clip_name(start)}: missing, so the run cannot go on; start anew with --force"
+                )
+        if self._fixed_range is None and not has_forces(folder / clip_name(0)):
+            # They were removed when the run finished, and colours cannot be stretched over another range without.
+            self._fixed_range = tuple(stage.GetPrimAtPath(WORLD).GetCustomDataByKey("legend")["range"])
+            if self._scene.frame_count > self._frame_count:
+                log.warning(
+                    "%s: colours keep the range of the first %d frames, %.3g to %.3g N, whose forces were not kept; "
+                    "with output.forces = true they would be",
+                    *(self._folder, self._frame_count, *self._fixed_range),
+                )
+
+    def _force_range(self) -> tuple[float, float]:
+        """Return the forces at both ends of the colours: as given, or those of the run so far."""
+        return self._fixed_range or self._forces.color_range()
+
+    def _new_clip(self) -> Sdf.Layer:
+        clip = Sdf.Layer.CreateAnonymous(".usdc")
+        forces = self._scene.output.forces or self._fixed_range is None
+        declare_samples(clip, self._shapes, self._scene, forces=forces)
+        return clip
+
+    def _write_rest(self, rest: Sequence[ShapeFrame], provenance: Mapping[str, object]) -> None:
+        layer, manifest = (Sdf.Layer.CreateAnonymous(suffix) for suffix in (".usdc", ".usda"))
+        define_rest(
+            Usd.Stage.Open(layer),
+            scene=self._scene,
+            shapes=self._shapes,
+            rest=rest,
+            provenance=provenance,
+            texture_folder=self._folder / TEXTURES_NAME,
+        )
+        declare_samples(manifest, self._shapes, self._scene, forces=self._scene.output.forces)
+        (self._folder / CLIPS_NAME).mkdir(exist_ok=True)
+        export_layer(layer, self._folder / GEOMETRY_NAME)
+        export_layer(manifest, self._folder / CLIPS_NAME / MANIFEST_NAME)
+
+    def _write_root(self, *, finished: bool) -> None:
+        """Write the root, which says which clip has which frames."""
+        root = Sdf.Layer.CreateAnonymous(".usda")
+        stage = Usd.Stage.Open(root)
+        set_metadata(stage, self._scene)
+        self._define_motion(stage)
+        if not finished:
+            set_progress(stage, self.saved_count, self._scene.frame_count)
+        if self._starts:
+            clips, last = Usd.ClipsAPI(stage.GetPrimAtPath(WORLD)), self.saved_count - 1
+            clips.SetClipPrimPath(str(WORLD))
+            clips.SetClipManifestAssetPath(f"./{CLIPS_NAME}/{MANIFEST_NAME}")
+            clips.SetClipAssetPaths([f"./{CLIPS_NAME}/{clip_name(start)}" for start in self._starts])
+            clips.SetClipActive([(start, number) for number, start in enumerate(self._starts)])
+            clips.SetClipTimes([(0, 0), (last, last)][: 1 + last])
+        # Without the stage, which would look for the sublayer beside a layer that is nowhere yet.
+        del stage
+        root.defaultPrim = WORLD.name
+        root.subLayerPaths.append(f"./{GEOMETRY_NAME}")
+        export_layer(root, self._folder / ROOT_NAME)
+
+    def _define_motion(self, stage: Usd.Stage) -> None:
+        """Write what depends on the motion so far."""
+        force_range = self._force_range()
+        _define_motion(stage, self._scene, self._shapes, self._bounds, self._rest_center, self.saved_count, force_range)
+
+
+def write_still(path: Path, *, scene: Scene, shapes: Sequence[Shape], rest: Sequence[ShapeFrame]) -> None:
+    """Write shapes that do not move as a stage of one frame.
+
+    Args:
+        path: the file to make, .usdc.
+        scene: what they are of.
+        shapes: what is shown.
+        rest: a sample of each.
+
+    Raises:
+        EnvironmentFailedError: the file cannot be written.
+    """
+    _require_writable(path.parent)
+    layer, histogram = Sdf.Layer.CreateAnonymous(".usdc"), ForceHistogram()
+    stage = Usd.Stage.Open(layer)
+    define_rest(stage, scene=scene, shapes=shapes, rest=rest, provenance={}, texture_folder=path.parent / TEXTURES_NAME)
+    for sample in rest:
+        histogram.add(sample.forces)
+    force_range = histogram.color_range()
+    for shape, sample in zip(shapes, rest, strict=True):
+        author_sample(layer, 0, shape, sample)
+        author_colors(layer, 0, shape, sample.forces, force_range)
+    bounds = _bounds_of(rest)
+    _define_motion(stage, scene, shapes, bounds, bounds.mean(axis=0), 1, force_range)
+    export_layer(layer, path)
+
+
+def _define_motion(
+    stage: Usd.Stage,
+    scene: Scene,
+    shapes: Sequence[Shape],
+    bounds: np.ndarray,
+    rest_center: np.ndarray,
+    frame_count: int,
+    force_range: tuple[float, float],
+) -> None:
+    """Write what depends on the motion: time range, legend, colliders and camera; lengths in m, forces in N."""
+    stage.SetStartTimeCode(0)
+    stage.SetEndTimeCode(max(frame_count - 1, 0))
+    world = stage.OverridePrim(WORLD)
+    world.SetCustomDataByKey("legend", legend(shapes, force_range))
+    define_colliders(stage, scene, bounds, rest_center)
+    define_camera(stage, scene, bounds)
+
+
+def _bounds_of(samples: Sequence[ShapeFrame]) -> np.ndarray:
+    """Return the lowest and the highest corner of the box around all points, float64 [2, 3], m."""
+    points = np.concatenate([sample.points for sample in samples]).astype(np.float64)
+    return np.stack([points.min(axis=0), points.max(axis=0)])
+
+
+def _require_writable(folder: Path) -> None:
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise EnvironmentFailedError(f"{folder}: cannot make this directory: {error.strerror}") from error
+    if not os.access(folder, os.W_OK | os.X_OK):
+        raise EnvironmentFailedError(f"{folder}: no permission to write in this directory")
+
+
+def _link(file: Path, name: Path) -> None:
+    """Give a file another name as well; where the file system cannot, make it a copy."""
+    name.unlink(missing_ok=True)
+    try:
+        os.link(file, name)
+    except OSError:
+        with whole_file(name) as unfinished:
+            shutil.copyfile(file, unfinished)
