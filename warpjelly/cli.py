@@ -274,6 +274,26 @@ def validate(
 
 
 @app.command()
+def pack(
+    source: Annotated[Path, typer.Argument(metavar="RUN_OR_STAGE", help="Run directory or stage.", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="File to write: .usdc, .usda or .usdz.", show_default=False)
+    ],
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+) -> None:
+    """Write a stage as one self-contained file, also that of a run that has not finished.
+
+    Textures go into a .usdz, and into a folder beside a .usdc or .usda.
+    """
+    from .files import refuse_to_replace
+    from .pack import pack as pack_stage
+
+    refuse_to_replace(output, force=force)
+    pack_stage(source, output)
+    print(f"stage: {output}")
+
+
+@app.command()
 def preview(
     source: Annotated[Path, typer.Argument(metavar="RUN_OR_STAGE", help="Run directory or stage.", show_default=False)],
     output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write, .png.", show_default=False)],
