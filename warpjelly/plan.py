@@ -260,14 +260,14 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     """
     # These imports take most of a second, which scenes without models need not spend.
     from .meshes import load_model
-    from .voxelize import LOOK_RESOLUTION, voxelize, voxelize_mesh
+    from .voxelize import LOOK_RESOLUTION, is_closed, voxelize, voxelize_mesh
 
     model = load_model(body.file, up_axis=up_axis, prim=body.prim)
     scale = 1.0 if body.scale is None else body.scale
     if body.fit is not None:
         scale = body.fit / model.mesh.extents.max()
     model = model.scaled(scale)
-    mesh = model.mesh
+    mesh, closed = model.mesh, is_closed(model.mesh)
     largest = mesh.extents.max()
     if not MIN_LENGTH <= largest <= MAX_LENGTH:
         raise SceneError(
@@ -277,10 +277,10 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     # By the divergence theorem.
     volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6
     _require_memory(
-        BYTES_AT_REST + BYTES_PER_CROSSING * _count_crossings(mesh, body),
+        BYTES_AT_REST + BYTES_PER_CROSSING * _count_crossings(mesh, body, closed=closed),
         f"bodies.{body.name}: voxels at resolution {body.resolution:,}",
     )
-    if body.resolution > LARGE_RESOLUTION and mesh.is_watertight:
+    if body.resolution > LARGE_RESOLUTION and closed:
         coarse, _ = voxelize_mesh(mesh, LOOK_RESOLUTION, method=body.method, pieces=body.pieces)
         # The count is right where the mesh overlaps itself, the volume where it is thin.
         count = min(
@@ -309,7 +309,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
         else _cells_in_mesh(region, body, model, scale, grid, up_axis)
         for region in body.regions
     ]
-    return VoxelizedModel(grid, bool(mesh.is_watertight), model, regions, volume, notes)
+    return VoxelizedModel(grid, closed, model, regions, volume, notes)
 
 
 def _cells_in_mesh(
@@ -348,12 +348,12 @@ def _cells_in_mesh(
     return inside
 
 
-def _count_crossings(mesh: trimesh.Trimesh, body: ModelBody) -> float:
+def _count_crossings(mesh: trimesh.Trimesh, body: ModelBody, *, closed: bool) -> float:
     """Return about how often rays along the columns of a model's grid cross its surface: as often as it is large."""
     # Twice the area of the triangles as seen along each axis, in cells.
     areas = np.abs(np.cross(*(np.diff(mesh.triangles, axis=1) * (body.resolution / mesh.extents.max())).swapaxes(0, 1)))
     seen = areas.sum(axis=0) / 2
-    votes = body.method == "vote" or (body.method == "auto" and not mesh.is_watertight)
+    votes = body.method == "vote" or (body.method == "auto" and not closed)
     return float(seen.sum() if votes else seen[2])
 
 
