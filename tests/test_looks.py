@@ -139,6 +139,8 @@ def test_names_are_said_to_be_missing(tmp_path: Path) -> None:
         ({"paint.mtl": "newmtl blue\nmap_Kd -bm 1 none.png"}, "the texture none.png cannot be read: No such file"),
         ({"paint.mtl": "newmtl blue\nmap_Kd"}, "paint.mtl: the texture . cannot be read: Is a directory"),
         ({"paint.mtl": f"newmtl blue\nmap_Kd {'a' * 300}.png"}, "cannot be read: File name too long"),
+        ({"paint.mtl": "newmtl blue\nmap_Kd a\0b.png"}, "the texture a?b.png cannot be read: embedded null byte"),
+        ({"paint.mtl": "newmtl blue\nmap_Kd -o 0.5 1e-05 -2E3 none.png"}, "the texture none.png cannot be read"),
         ({"paint.mtl": "newmtl blue\nKd red"}, "paint.mtl: material blue: cannot read 'kd red'"),
         ({"paint.mtl": "newmtl blue\nd"}, "paint.mtl: material blue: cannot read 'd'"),
         ({"paint.mtl": "newmtl blue"}, "a.obj: materials that are in none of its files: shiny red"),
@@ -155,6 +157,31 @@ def test_what_is_missing_of_materials_is_a_warning(
     assert_drawing(model)
     assert [look.inputs for look in model.looks] == [{}] * len(files)
     assert said in caplog.text
+
+
+@pytest.mark.parametrize(("name", "said"), [("a" * 300, "File name too long"), ("a\0b", "embedded null byte")])
+def test_a_name_that_no_file_has_is_a_warning(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, name: str, said: str
+) -> None:
+    """Read a model whose file of materials has a name that is too long, or none at all."""
+    (tmp_path / "a.obj").write_text(OBJ.replace("paint.mtl", name))
+    assert_drawing(load_model(tmp_path / "a.obj"))
+    assert said in caplog.text
+
+
+def test_byte_order_marks_are_passed_over(tmp_path: Path) -> None:
+    """Read text files as some editors save them, the first lines of which count, too."""
+    triangle = "0 0 0\n1 0 0\n0 1 0\n"
+    files = {
+        "a.obj": "".join(f"v {line}\n" for line in triangle.splitlines()) + "mtllib a.mtl\nusemtl red\nf 1 2 3\n",
+        "a.mtl": "newmtl red\nKd 1 0 0\n",
+        "a.off": f"OFF\n3 1 0\n{triangle}3 0 1 2\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text, encoding="utf-8-sig")
+    for name in ("a.obj", "a.off"):
+        np.testing.assert_array_equal(load_model(tmp_path / name).drawing.vertices, [[0, 0, 0], [1, 0, 0], [0, 1, 0]])
+    assert load_model(tmp_path / "a.obj").looks == [Look("red", {"diffuseColor": (1.0, 0.0, 0.0)})]
 
 
 def test_corners_without_uvs_and_normals(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
