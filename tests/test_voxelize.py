@@ -231,7 +231,10 @@ def test_open_mesh_reports_its_open_columns(device: str) -> None:
     assert voxelize(triangles, 6, device=device).open_columns == 0
     # Without one side in z every column crosses the surface once; without the sides in z none does.
     for sign in (-1, 1):
-        assert voxelize(triangles[outward != sign], 6, device=device).open_columns == 36
+        grid = voxelize(triangles[outward != sign], 6, device=device)
+        assert grid.open_columns == 36
+        # Rays come from below: what lacks its top is filled up to the end of the grid, what lacks its bottom is not.
+        np.testing.assert_array_equal(grid.cells.dense(), np.full((6, 6, 6), sign == 1))
     assert voxelize(triangles[outward == 0], 6, device=device).open_columns == 0
     # A missing triangle leaves the columns of half the side open, with or without its diagonal.
     hole = np.delete(triangles, np.flatnonzero(outward == 1)[0], axis=0)
@@ -278,25 +281,81 @@ def test_windings_count_both_ways_and_far(device: str) -> None:
             np.testing.assert_array_equal(grid.cells.dense(), windings != 0)
 
 
+def merged(*meshes: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return one mesh of several, with vertices that are equal made one, as models are read."""
+    mesh = trimesh.util.concatenate(meshes)
+    vertices, number = np.unique(mesh.vertices, axis=0, return_inverse=True)
+    return trimesh.Trimesh(vertices, number.reshape(-1)[mesh.faces], process=False)
+
+
+def block(lower: list[float], upper: list[float]) -> trimesh.Trimesh:
+    """Return a box between two corners."""
+    return trimesh.creation.box(bounds=[lower, upper])
+
+
+def with_faces(mesh: trimesh.Trimesh, faces: np.ndarray) -> trimesh.Trimesh:
+    """Return a mesh with other triangles."""
+    return trimesh.Trimesh(mesh.vertices, faces, process=False)
+
+
+def turn_over(mesh: trimesh.Trimesh, chosen: slice) -> trimesh.Trimesh:
+    """Return a mesh of which some triangles are turned over."""
+    faces = np.array(mesh.faces)
+    faces[chosen] = faces[chosen, ::-1]
+    return with_faces(mesh, faces)
+
+
+def with_slivers(mesh: trimesh.Trimesh) -> trimesh.Trimesh:
+    """Return a mesh with triangles of two corners in one place, as a ball of quads has them at its poles."""
+    faces = np.asarray(mesh.faces)
+    return with_faces(mesh, np.concatenate([faces, faces[:, [0, 0, 1]]]))
+
+
+BALL = CLOSED["sphere"]()
+TOUCHING = [block([0, 0, 0], [1, 1, 1]), block([1, 1, 0], [2, 2, 1]), block([2, 1, 0], [3, 2, 1])]
+ROD = block([0.5, 0.25, 0.25], [0.75, 3, 0.75])
+
+
 @pytest.mark.parametrize(
-    ("make", "closed", "method", "faults"),
+    ("mesh", "method", "faults"),
     [
-        (lambda: trimesh.creation.box(), True, "parity", []),
-        (CLOSED["union"], True, "parity", []),
-        (lambda: trimesh.Trimesh(*invert(trimesh.creation.box()), process=False), True, "parity", ["is inside out"]),
-        (overlap, True, "winding", ["intersects itself"]),
-        (lambda: trimesh.creation.box(), False, "vote", ["is not watertight"]),
+        (trimesh.creation.box(), "parity", []),
+        (CLOSED["union"](), "parity", []),
+        (turn_over(trimesh.creation.box(), slice(None)), "parity", ["is inside out"]),
+        (overlap(), "winding", ["intersects itself"]),
+        (merged(*TOUCHING), "parity", []),
+        (merged(*TOUCHING, ROD), "winding", ["intersects itself"]),
+        (with_slivers(BALL), "parity", []),
+        (turn_over(BALL, slice(5, 6)), "parity", ["has triangles that are turned over"]),
+        (turn_over(merged(*TOUCHING), slice(3, 4)), "parity", ["has triangles that are turned over"]),
+        (with_faces(BALL, BALL.faces[1:]), "vote", ["is not watertight"]),
     ],
-    ids=["box", "union", "inside out", "overlap", "open"],
+    ids=[
+        *("box", "union", "inside out", "overlap", "touching", "touching and overlap", "slivers"),
+        *("a triangle turned over", "touching and turned over", "open"),
+    ],
 )
-def test_the_method_suits_the_mesh(make, closed: bool, method: str, faults: list[str], device: str) -> None:
+def test_the_method_suits_the_mesh(mesh: trimesh.Trimesh, method: str, faults: list[str], device: str) -> None:
     """Choose the method by what is wrong with a mesh, and say what that is."""
-    assert choose_method(np.asarray(make().triangles), closed=closed, device=device) == (method, faults)
+    assert choose_method(mesh, device=device) == (method, faults)
 
 
-def invert(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
-    """Return vertices and faces of a mesh turned inside out."""
-    return mesh.vertices, mesh.faces[:, ::-1]
+@pytest.mark.parametrize(
+    ("mesh", "sound"),
+    [
+        (turn_over(BALL, slice(5, 6)), BALL),
+        (turn_over(BALL, slice(None, None, 2)), BALL),
+        (with_slivers(BALL), BALL),
+        (merged(*TOUCHING, ROD), join(*TOUCHING, ROD)),
+    ],
+    ids=["a triangle turned over", "half of them", "slivers", "touching and overlap"],
+)
+def test_closed_meshes_with_faults_are_filled_as_without(
+    mesh: trimesh.Trimesh, sound: trimesh.Trimesh, device: str
+) -> None:
+    """Fill what a mesh encloses, however its triangles turn and whatever touches."""
+    cells = [voxelize_mesh(one, 16, device=device)[0].cells.dense() for one in (mesh, sound)]
+    np.testing.assert_array_equal(*cells)
 
 
 @pytest.mark.parametrize(

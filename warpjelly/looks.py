@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -87,7 +88,9 @@ class Images:
     def _found(self, path: Path) -> tuple[str, bytes] | None:
         folder = self._model.parent
         try:
-            return path.name, (folder / path if (folder / path).exists() else folder / path.name).read_bytes()
-        except OSError as error:
-            log.warning("%s: the texture %s cannot be read: %s", self._model, path, error.strerror)
+            return path.name, (folder / path if os.path.exists(folder / path) else folder / path.name).read_bytes()
+        # A name that no file can have is a ValueError.
+        except (OSError, ValueError) as error:
+            why = getattr(error, "strerror", None) or error
+            log.warning("%s: the texture %s cannot be read: %s", self._model, str(path).replace("\0", "?"), why)
             return None

@@ -43,7 +43,7 @@ _MAPS = {
     "norm": ("normal", Texture("", b"", scale=NORMAL_SCALE, bias=NORMAL_BIAS)),
 }
 # Numbers that may stand behind an option of a map, at most; other options have one word.
-_NUMBER = re.compile(r"[-+]?[\d.]+")
+_NUMBER = re.compile(r"[-+]?[\d.]+(e[-+]?\d+)?", re.IGNORECASE)
 _OPTION_NUMBERS = {"-o": 3, "-s": 3, "-t": 3, "-mm": 2}
 
 
@@ -57,9 +57,11 @@ def read_mtl(model: Path, file: Path) -> list[Look]:
         file: the file.
     """
     try:
-        text = file.read_text(encoding="utf-8", errors="replace")
-    except OSError as error:
-        log.warning("%s: the materials of %s cannot be read: %s", model, file.name, error.strerror)
+        text = file.read_text(encoding="utf-8-sig", errors="replace")
+    # A name that no file can have is a ValueError.
+    except (OSError, ValueError) as error:
+        why = getattr(error, "strerror", None) or error
+        log.warning("%s: the materials of %s cannot be read: %s", model, file.name, why)
         return []
     found: dict[str, dict[str, list[str]]] = {}
     statements: dict[str, list[str]] = {}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -49,6 +50,8 @@ BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 BYTES_AT_REST = 300e6
 BYTES_PER_PARTICLE = {"float32": 240, "float64": 280}
 BYTES_PER_SPAN = 64
+# Where the vertices of a row along z are, for all rows of the grid, also where nothing is occupied.
+BYTES_PER_ROW = 16
 # With law "young" springs near the surface differ, so there are so many spans more per face of a jelly cube.
 YOUNG_SPANS = 2
 # Bytes at the peak of building a lattice alone.
@@ -88,6 +91,8 @@ class BodyPlan:
     """About as many spans of springs as this."""
     point_estimate: int
     """About as many points are shown as this."""
+    row_count: int = 0
+    """Number of rows along z of vertices of its grid."""
     voxel_count: int = 0
     """Number of jelly cubes."""
     triangle_count: int = 0
@@ -127,6 +132,7 @@ class Plan:
         return {
             plan.body.name or "": per_particle * plan.particle_count
             + BYTES_PER_SPAN * plan.span_estimate
+            + BYTES_PER_ROW * plan.row_count
             + per_point * plan.point_estimate
             + BYTES_PER_TRIANGLE * plan.triangle_count
             for plan in self.bodies
@@ -209,7 +215,13 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         PARTICLES: particles,
     }
     shown = sum(points[name] for name in set(scene.output.show))
-    return BodyPlan(body, names, build, particles, springs, spans, shown, cells.count, triangles, model)
+    rows = _count_rows(cells, per_edge)
+    return BodyPlan(body, names, build, particles, springs, spans, shown, rows, cells.count, triangles, model)
+
+
+def _count_rows(cells: Cells, particles_per_edge: int) -> int:
+    """Return the number of rows along z of vertices of a grid."""
+    return math.prod(n * (particles_per_edge - 1) + 1 for n in cells.shape[:2])
 
 
 def _assign_materials(
@@ -269,14 +281,14 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     """
     # These imports take most of a second, which scenes without models need not spend.
     from .meshes import load_model
-    from .voxelize import LOOK_RESOLUTION, voxelize, voxelize_mesh
+    from .voxelize import LOOK_RESOLUTION, is_closed, voxelize, voxelize_mesh
 
     model = load_model(body.file, up_axis=up_axis, prim=body.prim)
     scale = 1.0 if body.scale is None else body.scale
     if body.fit is not None:
         scale = body.fit / model.mesh.extents.max()
     model = model.scaled(scale)
-    mesh = model.mesh
+    mesh, closed = model.mesh, is_closed(model.mesh)
     largest = mesh.extents.max()
     if not MIN_LENGTH <= largest <= MAX_LENGTH:
         raise SceneError(
@@ -286,10 +298,10 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     # By the divergence theorem.
     volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6
     _require_memory(
-        BYTES_AT_REST + BYTES_PER_CROSSING * _count_crossings(mesh, body),
+        BYTES_AT_REST + BYTES_PER_CROSSING * _count_crossings(mesh, body, closed=closed),
         f"bodies.{body.name}: voxels at resolution {body.resolution:,}",
     )
-    if body.resolution > LARGE_RESOLUTION and mesh.is_watertight:
+    if body.resolution > LARGE_RESOLUTION and closed:
         coarse, _ = voxelize_mesh(mesh, LOOK_RESOLUTION, method=body.method, pieces=body.pieces)
         # The count is right where the mesh overlaps itself, the volume where it is thin.
         count = min(
@@ -318,7 +330,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
         else _cells_in_mesh(region, body, model, scale, grid, up_axis)
         for region in body.regions
     ]
-    return VoxelizedModel(grid, bool(mesh.is_watertight), model, regions, volume, notes)
+    return VoxelizedModel(grid, closed, model, regions, volume, notes)
 
 
 def _cells_in_mesh(
@@ -357,12 +369,12 @@ def _cells_in_mesh(
     return inside
 
 
-def _count_crossings(mesh: trimesh.Trimesh, body: ModelBody) -> float:
+def _count_crossings(mesh: trimesh.Trimesh, body: ModelBody, *, closed: bool) -> float:
     """Return about how often rays along the columns of a model's grid cross its surface: as often as it is large."""
     # Twice the area of the triangles as seen along each axis, in cells.
     areas = np.abs(np.cross(*(np.diff(mesh.triangles, axis=1) * (body.resolution / mesh.extents.max())).swapaxes(0, 1)))
     seen = areas.sum(axis=0) / 2
-    votes = body.method == "vote" or (body.method == "auto" and not mesh.is_watertight)
+    votes = body.method == "vote" or (body.method == "auto" and not closed)
     return float(seen.sum() if votes else seen[2])
 
 
@@ -378,6 +390,7 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, Lattice, dict[str, Any]]:
     grid = voxelized.grid
     particles, springs, spans, _ = count_lattice(grid.cells)
     needed = BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * particles + BYTES_PER_BUILT_SPAN * spans
+    needed += BYTES_PER_ROW * _count_rows(grid.cells, 2)
     _require_memory(needed, f"{grid.cells.count:,} voxels, {particles:,} particles and {springs:,} springs")
     lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
     return (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -110,7 +111,7 @@ def read_obj(path: Path) -> Model:
     Raises:
         ValueError: a line is wrong; the message has its number.
     """
-    text = path.read_text(encoding="utf-8", errors="replace").replace("\\\n", " ")
+    text = path.read_text(encoding="utf-8-sig", errors="replace").replace("\\\n", " ")
     obj = _Obj()
     for number, line in enumerate(text.split("\n"), 1):
         if words := (line.split("#", 1)[0] if "#" in line else line).split():
@@ -140,7 +141,7 @@ def _obj_looks(path: Path, libraries: list[str], names: set[str]) -> list[Look]:
     looks: dict[str, Look] = {}
     for library in libraries:
         # A name may have spaces, and there may be several names.
-        whole = (path.parent / library).exists()
+        whole = os.path.exists(path.parent / library)
         for file in [library] if whole else library.split():
             looks |= {look.name: look for look in read_mtl(path, path.parent / file.replace("\\", "/"))}
     unknown = sorted(names - looks.keys())
@@ -168,7 +169,7 @@ def read_off(path: Path) -> Model:
     Raises:
         ValueError: it is none.
     """
-    text = re.sub(r"#.*", "", path.read_text(encoding="utf-8", errors="replace")).strip()
+    text = re.sub(r"#.*", "", path.read_text(encoding="utf-8-sig", errors="replace")).strip()
     header = re.match(r"(ST)?C?N?OFF\b(?!\s+BINARY)", text)
     if not header:
         raise ValueError("it does not start with OFF")

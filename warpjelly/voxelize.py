@@ -79,7 +79,7 @@ def voxelize_mesh(
         The grid, which may be empty, and what the user should know of mesh and grid, a sentence each.
     """
     triangles = np.asarray(mesh.triangles)
-    chosen, faults = choose_method(triangles, closed=bool(mesh.is_watertight), device=device)
+    chosen, faults = choose_method(mesh, device=device)
     notes = []
     chosen = chosen if method == "auto" else method
     grid = voxelize(triangles, resolution, method=chosen, keep_thin_parts=keep_thin_parts, device=device)
@@ -106,17 +106,36 @@ def voxelize_mesh(
     return grid, notes
 
 
-def choose_method(triangles: np.ndarray, *, closed: bool, device: str = "cpu") -> tuple[str, list[str]]:
+def is_closed(mesh: trimesh.Trimesh) -> bool:
+    """Say whether a surface has no border: an even number of triangles meets at every edge.
+
+    Four do where solids touch, whose surfaces are as closed as before.
+    """
+    return bool(mesh.is_watertight) or not (_edge_counts(mesh)[0] % 2).any()
+
+
+def _edge_counts(mesh: trimesh.Trimesh) -> tuple[np.ndarray, np.ndarray]:
+    """Return how many triangles each edge has, and how many more run along it in one direction than in the other."""
+    ends = np.asarray(mesh.faces, np.int64)[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    # A triangle of two equal corners is no more than an edge there and back.
+    ends = ends[ends[:, 0] != ends[:, 1]]
+    _, edge = np.unique(ends.min(axis=1) * len(mesh.vertices) + ends.max(axis=1), return_inverse=True)
+    return np.bincount(edge), np.bincount(edge, np.where(ends[:, 0] < ends[:, 1], 1, -1))
+
+
+def choose_method(mesh: trimesh.Trimesh, *, device: str = "cpu") -> tuple[str, list[str]]:
     """Return the method that suits a mesh, and what is wrong with the mesh, in words.
 
     Args:
-        triangles: corners, float [triangle_count, 3, 3].
-        closed: whether every edge of the mesh joins two triangles.
+        mesh: as from ``load_mesh``.
         device: where to scan-convert.
     """
-    if not closed:
+    if not is_closed(mesh):
         return "vote", ["is not watertight"]
-    least, most = _Grid.around(triangles, LOOK_RESOLUTION, device).fill().windings
+    if not (mesh.is_watertight and mesh.is_winding_consistent) and _edge_counts(mesh)[1].any():
+        # Windings mean nothing then.
+        return "parity", ["has triangles that are turned over"]
+    least, most = _Grid.around(np.asarray(mesh.triangles), LOOK_RESOLUTION, device).fill().windings
     faults = []
     if least < 0:
         faults.append("is inside out" if most == 0 else "is partly inside out")
@@ -171,7 +190,7 @@ def voxelize_on_grid(
         SceneError: holes leave too much to winding numbers.
     """
     triangles = np.asarray(mesh.triangles)
-    method, faults = choose_method(triangles, closed=bool(mesh.is_watertight), device=device)
+    method, faults = choose_method(mesh, device=device)
     given = _Grid(triangles, grid.cells.shape, grid.origin, grid.cell_size, device)
     notes = [f"the mesh {' and '.join(faults)}; method {method}: {METHODS[method]}"] if faults else []
     return _fill(triangles, given, method, keep_thin_parts).cells, notes
