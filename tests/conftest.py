@@ -36,5 +36,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _has_egl() -> bool:
     # In a process of its own: where it does not work, VTK may crash instead of failing.
-    script = "from warpjelly.preview import require_pyvista; require_pyvista()"
+    script = "from warpjelly.view import require_pyvista; require_pyvista()"
     return subprocess.run([sys.executable, "-c", script], check=False, capture_output=True).returncode == 0

@@ -728,6 +728,9 @@ def test_preview_makes_a_picture_of_a_run(warpjelly, tmp_path):
     assert code == 0
     assert str(picture) in out
     assert picture.read_bytes().startswith(b"\x89PNG")
-    code, _, err = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 3)
+    code, _, err = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 2)
+    assert code == 2
+    assert "--force" in one_line(err)
+    code, _, err = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 3, "--force")
     assert code == 2
     assert "0 to 2" in one_line(err)

@@ -10,7 +10,7 @@ import signal
 import sys
 import tomllib
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from operator import itemgetter
 from pathlib import Path
@@ -265,25 +265,39 @@ def validate(
 @app.command()
 def preview(
     source: Annotated[Path, typer.Argument(metavar="RUN_OR_STAGE", help="Run directory or stage.", show_default=False)],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write, .png.", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="File to write: .png, .mp4 or .webp.", show_default=False)
+    ],
     frames: Annotated[
         list[int],
         typer.Option(
             "--frame",
-            help="Frame to show; repeat it for several side by side. The moment of the hardest impact unless given.",
+            help="In a picture, a frame to show, repeated for several side by side; the moment of the hardest impact "
+            "unless given. In a movie, given twice, the first and the last; all unless given.",
             show_default=False,
         ),
     ] = [],  # noqa: B006
+    every: Annotated[int, typer.Option(min=1, help="In a movie, show every so many frames.")] = 1,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of a frame in pixels.")] = "960x540",
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
-    """Look at a result without a USD viewer."""
+    """Look at a result without a USD viewer: a picture (.png) or a movie in real time (.mp4, .webp)."""
     if not (sides := re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size)):
         raise InputError(f"--size {size}: give width x height in pixels, for example 960x540")
 
     from .preview import render_preview
 
-    render_preview(source, output, frames=frames or None, size=(int(sides[1]), int(sides[2])))
-    print(f"picture: {output}")
+    with _progress("rendering") as show:
+        render_preview(
+            source,
+            output,
+            frames=frames or None,
+            every=every,
+            size=(int(sides[1]), int(sides[2])),
+            force=force,
+            progress=show,
+        )
+    print(f"preview: {output} ({output.stat().st_size / 1e6:.1f} MB)")
 
 
 @app.command()
@@ -326,7 +340,10 @@ def doctor() -> None:
         print("  no CUDA device; simulations run on the CPU")
     print(f"kernel cache: {wp.config.kernel_cache_dir}")
     print("optional parts:")
-    for extra, modules in [("preview", ["pyvista"]), ("formats", ["lxml", "networkx", "collada"])]:
+    for extra, modules in [
+        ("preview", ["pyvista", "PIL", "imageio_ffmpeg", "matplotlib"]),
+        ("formats", ["lxml", "networkx", "collada"]),
+    ]:
         missing = "" if all(map(util.find_spec, modules)) else f"missing: pip install 'warpjelly[{extra}]'"
         print(f"  {extra:<10} {missing or 'present'}")
 
@@ -340,6 +357,26 @@ def main() -> None:
     # Termination is an interruption like Ctrl-C: the frames that were finished are saved.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(_guarded())
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Give a function that shows how many frames are done, of how many; only on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TextColumn("frames "))
+    console = Console(stderr=True)
+    with Progress(
+        *columns,
+        TimeRemainingColumn(),
+        TextColumn("left"),
+        console=console,
+        disable=not sys.stderr.isatty(),
+        transient=True,
+    ) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _guarded() -> int:

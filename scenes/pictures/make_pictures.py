@@ -36,7 +36,7 @@ def show(scene: str, frames: list[int], picture: Path) -> None:
     """Run a scene and write some of its frames into a PNG."""
     with tempfile.TemporaryDirectory() as folder:
         wj.simulate(wj.load_scene(HERE.parent / f"{scene}.toml"), output=folder)
-        render_preview(Path(folder), picture, frames=frames, size=SIZE)
+        render_preview(Path(folder), picture, frames=frames, size=SIZE, force=True)
 
 
 def main(chosen: list[str]) -> None:
