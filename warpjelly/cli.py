@@ -266,22 +266,26 @@ def validate(
 def preview(
     source: Annotated[Path, typer.Argument(metavar="RUN_OR_STAGE", help="Run directory or stage.", show_default=False)],
     output: Annotated[
-        Path, typer.Option("-o", "--output", help="File to write: .png, .mp4 or .webp.", show_default=False)
+        Path, typer.Option("-o", "--output", help="File to write: .png, .mp4, .webp or .html.", show_default=False)
     ],
     frames: Annotated[
         list[int],
         typer.Option(
             "--frame",
             help="In a picture, a frame to show, repeated for several side by side; the moment of the hardest impact "
-            "unless given. In a movie, given twice, the first and the last; all unless given.",
+            "unless given. In a movie or page, given twice, the first and the last; all unless given.",
             show_default=False,
         ),
     ] = [],  # noqa: B006
-    every: Annotated[int, typer.Option(min=1, help="In a movie, show every so many frames.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="In a movie or page, show every so many frames.")] = 1,
     size: Annotated[str, typer.Option(metavar="WxH", help="Size of a frame in pixels.")] = "960x540",
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
-    """Look at a result without a USD viewer: a picture (.png) or a movie in real time (.mp4, .webp)."""
+    """Look at a result without a USD viewer.
+
+    The name of the file says as what: a picture (.png), a movie in real time (.mp4, .webp), or a page to look around
+    in, which plays from disk in any browser (.html).
+    """
     if not (sides := re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size)):
         raise InputError(f"--size {size}: give width x height in pixels, for example 960x540")
 

@@ -12,6 +12,7 @@ from .captions import captioned
 from .errors import EnvironmentFailedError, InputError
 from .files import whole_file
 from .movies import MOVIES, movie_writer
+from .review import review_page
 from .solids import shapes_in
 from .usd import open_stage
 from .validate import stage_problems
@@ -20,7 +21,7 @@ from .view import View
 MIN_SIZE, MAX_SIZE = 16, 8192
 MAX_PIXELS = 100_000_000
 
-_FORMATS = (".png", *MOVIES)
+_FORMATS = (".png", *MOVIES, ".html")
 
 
 def render_preview(
@@ -35,15 +36,16 @@ def render_preview(
 ) -> None:
     """Show a stage as a file of the kind that its name tells.
 
-    A PNG has frames side by side; MP4 and WebP are movies in real time.
+    A PNG has frames side by side; MP4 and WebP are movies in real time; HTML is a page to look around in.
 
     Args:
         source: a stage file or a run directory.
         output: the file to make; it appears under its name only when it is complete.
         frames: numbers of frames. Of a PNG those to show; None shows the one with the greatest forces, which is the
-            moment of the hardest impact. Of a movie the first and the last; None shows all.
-        every: a movie shows each ``every``-th frame from the first on.
-        size: width and height of each frame, pixels. Those of an MP4 are rounded up to even numbers.
+            moment of the hardest impact. Of a movie or page the first and the last; None shows all.
+        every: a movie or page shows each ``every``-th frame from the first on.
+        size: width and height of each frame of a picture or movie, pixels. Those of an MP4 are rounded up to even
+            numbers.
         force: replace a file that is there already.
         progress: called after each frame with the number of frames done and in all.
 
@@ -68,6 +70,8 @@ def render_preview(
         with whole_file(output) as unfinished:
             if kind == ".png":
                 _write_picture(stage, unfinished, shown, size, progress)
+            elif kind == ".html":
+                unfinished.write_text(review_page(stage, shown, progress), encoding="utf-8")
             else:
                 _write_movie(stage, unfinished, shown, every, size, progress)
     except OSError as error:
@@ -89,7 +93,7 @@ def _chosen_frames(
             raise InputError(f"{source}: no frame {frame}; frames are {first} to {last}")
     if single:
         if every != 1:
-            raise InputError("a picture shows single frames: choose them with --frame; --every is for movies")
+            raise InputError("a picture shows single frames: choose them with --frame; --every is for movies and pages")
         if frames is None:
             return [_brightest_frame(stage, first, last)]
         if not frames:
@@ -99,7 +103,7 @@ def _chosen_frames(
         raise InputError(f"every {every}: it must be at least 1")
     if frames is not None:
         if len(frames) != 2 or frames[0] > frames[1]:
-            raise InputError("a movie shows all frames, or those from the first to the second of two --frame")
+            raise InputError("movies and pages show all frames, or those from the first to the second of two --frame")
         first, last = frames
     return list(range(first, last + 1, every))
 

@@ -59,6 +59,14 @@ def the_camera(stage: Usd.Stage) -> UsdGeom.Camera:
     return camera
 
 
+def room_floor(stage: Usd.Stage, points: np.ndarray) -> np.ndarray:
+    """Return the corners [4, 3] of the rectangle at the bottom of a room, given points [n, 3] of its edges, m."""
+    up = 2 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else 1
+    low, high = points.min(axis=0), points.max(axis=0)
+    side, other = np.eye(3)[(up + 1) % 3] * (high - low), np.eye(3)[(up + 2) % 3] * (high - low)
+    return np.array([low, low + side, low + side + other, low + other])
+
+
 class StageDrawing:
     """Draws the frames of a stage; materials are read once."""
 
@@ -206,7 +214,8 @@ def _placed_uvs(texture: Texture, uvs: np.ndarray) -> np.ndarray:
     return ((uvs * placing.scale) @ turn.T + placing.translation).astype(np.float32)
 
 
-def _image(pyvista: Any, texture: Texture) -> pv.Texture:
+def texture_pixels(texture: Texture) -> np.ndarray:
+    """Return the colours of a texture, sRGB, uint8 [height, width, 3], from its upper left on."""
     from PIL import Image
 
     with Image.open(BytesIO(texture.data)) as picture:
@@ -214,8 +223,12 @@ def _image(pyvista: Any, texture: Texture) -> pv.Texture:
     if not texture.srgb:
         pixels = srgb_from_linear(pixels)
     scaled = np.clip(pixels * texture.scale[:3] + texture.bias[:3], 0.0, 1.0)
+    return np.rint(scaled * 255).astype(np.uint8)
+
+
+def _image(pyvista: Any, texture: Texture) -> pv.Texture:
     # A picture starts at its upper left, a texture at its lower left.
-    image = pyvista.numpy_to_texture(np.ascontiguousarray(np.rint(scaled * 255).astype(np.uint8)[::-1]))
+    image = pyvista.numpy_to_texture(np.ascontiguousarray(texture_pixels(texture)[::-1]))
     image.repeat = texture.wrap[0] == "repeat"
     image.mipmap = image.interpolate = True
     return image

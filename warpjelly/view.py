@@ -9,11 +9,11 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from pxr import Usd, UsdGeom
+from pxr import Usd
 
 from .errors import EnvironmentFailedError, InputError
 from .floors import BACKGROUND, Floor
-from .solids import Drawn, Solid, StageDrawing, the_camera
+from .solids import Drawn, Solid, StageDrawing, room_floor, the_camera
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -145,8 +145,9 @@ class View:
     def _lay_floors(self, drawn: Drawn, to_light: np.ndarray) -> None:
         """Draw the floors with the shadows of the solids; they are only made anew where they or the camera move."""
         camera = self._plotter.camera
-        floors = drawn.floors or [_room_floor(self._pyvista, self._stage, room) for room in drawn.rooms]
-        corners = [np.asarray(floor.points, np.float64) for floor in floors]
+        corners = [np.asarray(floor.points, np.float64) for floor in drawn.floors]
+        if not corners:
+            corners = [room_floor(self._stage, np.asarray(room.points, np.float64)) for room in drawn.rooms]
         seen_from = np.array([camera.position, camera.focal_point])
         if (made_for := np.concatenate([*corners, seen_from]).tobytes()) != self._floors_for:
             self._floors_for = made_for
@@ -160,14 +161,6 @@ class View:
                 )
         for floor in self._floors:
             floor.shade(np.concatenate([_sampled(solid.surface, floor.shadow_pixel) for solid in drawn.solids]))
-
-
-def _room_floor(pyvista: Any, stage: Usd.Stage, room: pv.PolyData) -> pv.PolyData:
-    """Return the rectangle at the bottom of a room that is drawn as its edges."""
-    up = 2 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else 1
-    low, high = np.array(room.bounds).reshape(3, 2).T
-    side, other = np.eye(3)[(up + 1) % 3] * (high - low), np.eye(3)[(up + 2) % 3] * (high - low)
-    return pyvista.PolyData(np.array([low, low + side, low + side + other, low + other]), faces=[4, 0, 1, 2, 3])
 
 
 def _sampled(solid: pv.PolyData, spacing: float) -> np.ndarray:
