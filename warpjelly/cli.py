@@ -278,7 +278,17 @@ def preview(
         ),
     ] = [],  # noqa: B006
     every: Annotated[int, typer.Option(min=1, help="In a movie or page, show every so many frames.")] = 1,
-    size: Annotated[str, typer.Option(metavar="WxH", help="Size of a frame in pixels.")] = "960x540",
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH",
+            help="Size in pixels of a frame, 960x540 unless given, or of plots, 1400x800.",
+            show_default=False,
+        ),
+    ] = None,
+    plots: Annotated[
+        bool, typer.Option("--plots", help="Plot the run's metrics over time: energies, momentum, contacts ...")
+    ] = False,
     force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
     """Look at a result without a USD viewer.
@@ -286,21 +296,21 @@ def preview(
     The name of the file says as what: a picture (.png), a movie in real time (.mp4, .webp), or a page to look around
     in, which plays from disk in any browser (.html).
     """
-    if not (sides := re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size)):
+    sides = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size or ("1400x800" if plots else "960x540"))
+    if not sides:
         raise InputError(f"--size {size}: give width x height in pixels, for example 960x540")
+    pixels = int(sides[1]), int(sides[2])
+    if plots:
+        if frames or every != 1:
+            raise InputError("--plots shows all frames: leave out --frame and --every")
+        from .plots import plot_metrics
 
-    from .preview import render_preview
+        plot_metrics(source, output, size=pixels, force=force)
+    else:
+        from .preview import render_preview
 
-    with _progress("rendering") as show:
-        render_preview(
-            source,
-            output,
-            frames=frames or None,
-            every=every,
-            size=(int(sides[1]), int(sides[2])),
-            force=force,
-            progress=show,
-        )
+        with _progress("rendering") as show:
+            render_preview(source, output, frames=frames or None, every=every, size=pixels, force=force, progress=show)
     print(f"preview: {output} ({output.stat().st_size / 1e6:.1f} MB)")
 
 

@@ -10,7 +10,7 @@ from pxr import Usd, UsdGeom
 
 from .captions import captioned
 from .errors import EnvironmentFailedError, InputError
-from .files import whole_file
+from .files import refuse_to_replace, whole_file
 from .movies import MOVIES, movie_writer
 from .review import review_page
 from .solids import shapes_in
@@ -76,12 +76,6 @@ def render_preview(
                 _write_movie(stage, unfinished, shown, every, size, progress)
     except OSError as error:
         raise EnvironmentFailedError(f"{output}: cannot write the preview: {error.strerror or error}") from error
-
-
-def refuse_to_replace(output: Path, *, force: bool) -> None:
-    """Raise InputError where a file is there already."""
-    if output.exists() and not force:
-        raise InputError(f"{output}: there already; choose another name, or replace it with --force")
 
 
 def _chosen_frames(
