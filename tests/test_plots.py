@@ -57,12 +57,7 @@ def test_plots_are_a_picture(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "output", "size", "what"),
     [
-        (
-            ",".join(COLUMNS) + "\n" + ",".join("a" * len(COLUMNS)) + "\n",
-            "p.png",
-            (900, 500),
-            "not the metrics of a run",
-        ),
+        (",".join(COLUMNS) + "\n" + "a," * len(COLUMNS), "p.png", (900, 500), "not the metrics of a run"),
         (None, "p.png", (900, 500), r"no metrics\.csv here"),
         ("", "p.png", (900, 500), "not the metrics of a run"),
         ("time,kinetic\n0,1\n", "p.png", (900, 500), "not the metrics of a run"),

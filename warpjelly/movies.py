@@ -16,7 +16,7 @@ from .errors import InputError
 # repeats for ever; the quality goes up to 100, higher is better.
 _ENCODERS = {
     ".mp4": "-codec:v libx264 -pix_fmt yuv420p -crf 18 -movflags +faststart",
-    ".webp": "-codec:v libwebp_anim -pix_fmt yuva420p -quality 75 -loop 0",
+    ".webp": "-codec:v libwebp_anim -pix_fmt yuva420p -quality 90 -loop 0",
 }
 MOVIES = tuple(_ENCODERS)
 

@@ -216,8 +216,10 @@ def _placed_uvs(texture: Texture, uvs: np.ndarray) -> np.ndarray:
 
 def texture_pixels(texture: Texture) -> np.ndarray:
     """Return the colours of a texture, sRGB, uint8 [height, width, 3], from its upper left on."""
-    from PIL import Image
-
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise InputError("textures need Pillow: pip install 'warpjelly[preview]'") from error
     with Image.open(BytesIO(texture.data)) as picture:
         pixels = np.asarray(picture.convert("RGB")) / 255.0
     if not texture.srgb:
