@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browsers import opened
-from pxr import UsdGeom, UsdShade, Vt
+from pxr import Sdf, UsdGeom, UsdShade, Vt
 from stages import cube_surface, make_scene, write_stage
 
 from warpjelly.colors import SRGB_TABLE, srgb_from_linear
@@ -105,6 +105,35 @@ def test_page_shows_the_models_own_colors(tmp_path: Path) -> None:
     np.testing.assert_allclose(blue, srgb_from_linear(np.array([0.2, 0.5, 0.8])))
     np.testing.assert_allclose(mean, np.array([127.5, 100, 100]) / 255)
     assert own is None
+
+
+@pytest.mark.parametrize(("sharp", "points", "smooth"), [(1, 9, True), (12, 8, False)])
+def test_few_edges_split_points_and_many_are_shaded_flat(tmp_path: Path, sharp: int, points: int, smooth: bool) -> None:
+    """Draw a box of triangles whose corners have normals of their own: one of them, or as many as triangles."""
+    corners = np.array(
+        [0, 1, 3, 0, 3, 2, 4, 7, 5, 4, 6, 7, 0, 5, 1, 0, 4, 5, 2, 3, 7, 2, 7, 6, 0, 2, 6, 0, 6, 4, 1, 7, 3, 1, 5, 7]
+    )
+    path, page = write_stage(tmp_path / "stage.usdc"), tmp_path / "r.html"
+    stage = open_stage(path)
+    box = UsdGeom.Mesh.Define(stage, "/World/box")
+    box.CreateSubdivisionSchemeAttr("none")
+    box.CreatePointsAttr([tuple(place) for place in np.ndindex(2, 2, 2)])
+    box.CreateExtentAttr([(0, 0, 0), (1, 1, 1)])
+    box.CreateFaceVertexCountsAttr([3] * 12)
+    box.CreateFaceVertexIndicesAttr(corners.tolist())
+    box.CreateDisplayColorAttr([(1, 0, 0)])
+    normals = UsdGeom.PrimvarsAPI(box).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, "faceVarying")
+    normals.Set([(0, 0, 1)] * 20)
+    # Beside the normals of the points there is another one for a corner of some triangles.
+    own = np.where(np.arange(36) % 3 + 36 * (np.arange(36) // 3 >= sharp) == 0, 8 + np.arange(36) // 3, corners)
+    normals.SetIndices(Vt.IntArray(own.tolist()))
+    stage.Save()
+    render_preview(path, page)
+    drawn = contents(page)[0]["shapes"]
+    shape = next(shape for shape in drawn if shape["triangles"] == 12)
+    assert (shape["points"], shape["smooth"]) == (points, smooth)
+    triangles, places, _ = unpacked(page)[drawn.index(shape)]
+    np.testing.assert_allclose(places[0][triangles.ravel()], np.array(list(np.ndindex(2, 2, 2)))[corners], atol=1e-6)
 
 
 def test_too_much_for_a_page_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import resources
+from types import EllipsisType
 from typing import Any
 
 import numpy as np
@@ -31,6 +32,8 @@ from .solids import colors_at, diffuse, room_floor, shapes_in, texture_pixels, t
 MAX_BYTES = 1_000_000_000
 _BYTES_PER_POINT = 7
 _BALL_SUBDIVISIONS = 4
+# A mesh whose points would be more than so many times as many if they were split at edges is shaded flat.
+_MOST_SPLIT = 1.5
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,8 @@ class _Shape:
     """Points at the corners, int [triangle_count, 3]; none of lines and balls."""
     parts: list[dict[str, Any]]
     """Triangles in turn: how many, and their one colour or None."""
+    chosen: np.ndarray | EllipsisType = ...
+    """Which of the places and their colours are taken, and how often."""
     smooth: bool = True
     """Whether a surface looks smooth rather than flat between its edges."""
     width: float = 0.0
@@ -106,7 +111,8 @@ def _surfaces(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
     for mesh in shapes_in(stage, UsdGeom.Mesh):
         points, counts = mesh.GetPointsAttr(), np.array(mesh.GetFaceVertexCountsAttr().Get(frame))
         corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
-        triangles, faces = triangulate(np.array(points.Get(frame)).reshape(-1, 3), counts, corners)
+        chosen, corners, smooth = _split_at_edges(mesh, corners, frame)
+        triangles, faces = triangulate(np.array(points.Get(frame)).reshape(-1, 3)[chosen], counts, corners)
         subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
         own = np.full(len(counts), len(subsets))
         for number, subset in enumerate(subsets):
@@ -118,9 +124,28 @@ def _surfaces(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
             {"count": size, "color": colors[number]}
             for number, size in zip(numbers.tolist(), sizes.tolist(), strict=True)
         ]
-        by_corner = UsdGeom.PrimvarsAPI(mesh).HasPrimvar("normals")
         kind = "floor" if len(counts) == 1 else "surface"
-        yield _Shape(mesh.GetPrim(), kind, points.Get, triangles[order], parts, smooth=not by_corner)
+        yield _Shape(mesh.GetPrim(), kind, points.Get, triangles[order], parts, chosen, smooth)
+
+
+def _split_at_edges(
+    mesh: UsdGeom.Mesh, corners: np.ndarray, frame: int
+) -> tuple[np.ndarray | EllipsisType, np.ndarray, bool]:
+    """Split points where a mesh has several normals: return which are taken, the corners, and whether it is smooth.
+
+    The player computes a normal for each point. A mesh with edges everywhere stays as it is and is shaded flat, which
+    is smaller.
+    """
+    normals = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
+    if not normals:
+        return ..., corners, True
+    if not normals.IsIndexed() or normals.GetInterpolation() != UsdGeom.Tokens.faceVarying:
+        return ..., corners, False
+    pairs = np.stack([corners, np.array(normals.GetIndices(frame))], axis=1)
+    found, own = np.unique(pairs, axis=0, return_inverse=True)
+    if len(found) > _MOST_SPLIT * len(mesh.GetPointsAttr().Get(frame)):
+        return ..., corners, False
+    return found[:, 0], own.ravel(), True
 
 
 def _spheres(stage: Usd.Stage) -> Iterator[_Shape]:
@@ -176,19 +201,20 @@ def _packed(shape: _Shape, frames: Sequence[int]) -> tuple[dict[str, Any], bytes
     places = []
     for frame in frames:
         matrix = np.array(UsdGeom.XformCache(frame).GetLocalToWorldTransform(shape.prim))
-        points = np.array(shape.points(frame), np.float32).reshape(-1, 3)
+        points = np.array(shape.points(frame), np.float32).reshape(-1, 3)[shape.chosen]
         places.append((points @ matrix[:3, :3] + matrix[3, :3]).astype(np.float32))
     positions = _once_if_still(np.stack(places))
     low = positions.min(axis=(0, 1), initial=np.inf)
     size = np.maximum(positions.max(axis=(0, 1), initial=-np.inf) - low, 1e-9)
     steps = _differences(np.rint((positions - low) / size * 65535).astype(np.uint16))
 
-    gprim, count = UsdGeom.Gprim(shape.prim), positions.shape[1]
+    gprim, count = UsdGeom.Gprim(shape.prim), len(shape.points(frames[0]))
     varies = UsdGeom.Primvar(gprim.GetDisplayColorAttr()).ValueMightBeTimeVarying()
-    palette, indices = _palette([colors_at(gprim, frame, count) for frame in (frames if varies else frames[:1])])
+    colored = frames if varies else frames[:1]
+    palette, indices = _palette([colors_at(gprim, frame, count)[shape.chosen] for frame in colored])
     description = {
         "kind": shape.kind,
-        "points": count,
+        "points": positions.shape[1],
         "triangles": len(shape.triangles),
         "parts": shape.parts,
         "smooth": shape.smooth,
