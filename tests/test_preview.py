@@ -186,6 +186,13 @@ def test_thinned_movie_keeps_its_pace(tmp_path: Path) -> None:
     np.testing.assert_allclose(durations, 3 / 24 * 1000, atol=1)
 
 
+def test_more_frames_than_movies_show_are_refused(tmp_path: Path) -> None:
+    """Say how to thin the frames of a stage that has very many a second."""
+    path = write_stage(tmp_path / "stage.usdc", make_scene(fps=2000.0))
+    with pytest.raises(InputError, match=r"1000 frames a second .* --every 17"):
+        render_preview(path, tmp_path / "m.webp", every=2)
+
+
 @pytest.mark.egl
 def test_failing_encoder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Say in one line that ffmpeg failed and why, and leave no movie behind."""

@@ -10,7 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError
+from .errors import EnvironmentFailedError, InputError
 
 # H.264 as browsers play it, from the first bytes of the file on; the quality is 0 to 51, lower is better. WebP that
 # repeats for ever; the quality goes up to 100, higher is better.
@@ -32,16 +32,21 @@ def movie_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Call
 
     Raises:
         InputError: imageio-ffmpeg is not installed.
+        EnvironmentFailedError: there is no ffmpeg for this kind of machine.
         OSError: ffmpeg failed.
     """
     try:
         from imageio_ffmpeg import get_ffmpeg_exe
     except ImportError as error:
         raise InputError("movies need imageio-ffmpeg: pip install 'warpjelly[preview]'") from error
+    try:
+        ffmpeg = get_ffmpeg_exe()
+    except RuntimeError as error:
+        raise EnvironmentFailedError(f"movies need ffmpeg: {error}") from error
     rate = str(Fraction(fps).limit_denominator(100_000))
     pictures = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", rate, "-i", "-"]
     encoder = _ENCODERS[path.suffix.lower()].split()
-    command = [get_ffmpeg_exe(), "-y", "-v", "error", *pictures, *encoder, str(path)]
+    command = [ffmpeg, "-y", "-v", "error", *pictures, *encoder, str(path)]
     with tempfile.TemporaryFile("w+") as said:
         with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=said) as process:
             pipe = process.stdin
@@ -57,4 +62,6 @@ def movie_writer(path: Path, size: tuple[int, int], fps: float) -> Iterator[Call
                 raise
         if process.returncode:
             said.seek(0)
-            raise OSError(f"ffmpeg: {' '.join(said.read().split())}")
+            # The last line of what it said is the one that counts.
+            *_, reason = said.read().strip().split("\n")
+            raise OSError(f"ffmpeg: {reason}")

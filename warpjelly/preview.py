@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from .view import View
 
 MIN_SIZE, MAX_SIZE = 16, 8192
 MAX_PIXELS = 100_000_000
+MAX_FPS = 120
 
 _FORMATS = (".png", *MOVIES, ".html")
 
@@ -47,7 +49,7 @@ def render_preview(
         size: width and height of each frame of a picture or movie, pixels. Those of an MP4 are rounded up to even
             numbers.
         force: replace a file that is there already.
-        progress: called after each frame with the number of frames done and in all.
+        progress: called after each frame, or shape of a page, with the number of those done and in all.
 
     Raises:
         InputError: the stage, the output name, a frame number or the size is wrong, the file is there already, or the
@@ -137,6 +139,9 @@ def _write_movie(
         # Colours are stored for two by two pixels, which every player understands.
         size = (size[0] + size[0] % 2, size[1] + size[1] % 2)
     fps = stage.GetTimeCodesPerSecond() / every
+    if fps > MAX_FPS:
+        least = math.ceil(stage.GetTimeCodesPerSecond() / MAX_FPS)
+        raise InputError(f"{fps:g} frames a second are more than movies show: thin them with --every {least}")
     with View(stage, size) as view, movie_writer(path, size, fps) as add:
         for done, frame in enumerate(frames, start=1):
             picture = view.render(frame)
