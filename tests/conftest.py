@@ -1,13 +1,15 @@
-"""Fixtures and the home of the ``egl`` marker."""
+"""Fixtures and the home of the markers ``egl`` and ``browser``."""
 
 from __future__ import annotations
 
 import os
 import subprocess
 import sys
+from importlib import util
 
 import pytest
 import warp as wp
+from browsers import chromium
 
 from warpjelly.device import start_warp
 
@@ -26,15 +28,23 @@ def precision(request: pytest.FixtureRequest) -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests marked ``egl`` where offscreen OpenGL is missing, unless WARPJELLY_REQUIRE_EGL=1 forbids it."""
-    marked = [item for item in items if item.get_closest_marker("egl")]
-    if not marked or os.environ.get("WARPJELLY_REQUIRE_EGL") == "1" or _has_egl():
-        return
-    for item in marked:
-        item.add_marker(pytest.mark.skip(reason="offscreen OpenGL does not work here"))
+    """Skip marked tests where what they need is missing, unless WARPJELLY_REQUIRE_EGL=1 or ..._BROWSER=1 forbids it."""
+    for marker, is_there, reason in (
+        ("egl", _has_egl, "offscreen OpenGL does not work here"),
+        ("browser", _has_browser, "no Chromium here"),
+    ):
+        marked = [item for item in items if item.get_closest_marker(marker)]
+        if not marked or os.environ.get(f"WARPJELLY_REQUIRE_{marker.upper()}") == "1" or is_there():
+            continue
+        for item in marked:
+            item.add_marker(pytest.mark.skip(reason=reason))
+
+
+def _has_browser() -> bool:
+    return chromium() is not None and util.find_spec("playwright") is not None
 
 
 def _has_egl() -> bool:
     # In a process of its own: where it does not work, VTK may crash instead of failing.
-    script = "from warpjelly.preview import require_pyvista; require_pyvista()"
+    script = "from warpjelly.view import require_pyvista; require_pyvista()"
     return subprocess.run([sys.executable, "-c", script], check=False, capture_output=True).returncode == 0

@@ -246,6 +246,9 @@ def test_an_interrupted_run_keeps_its_frames(warpjelly, tmp_path, monkeypatch):
         (["preview", "none.usdc", "-o", "a.png"], "none.usdc"),
         (["preview", "none.usdc"], "output"),
         (["preview", "none.usdc", "-o", "a.png", "--size", "big"], "--size big"),
+        (["preview", "none.usdc", "-o", "a.png", "--plots"], "none.usdc"),
+        (["preview", "none.usdc", "-o", "a.png", "--plots", "--frame", "1"], "--frame"),
+        (["preview", "none.usdc", "-o", "a.png", "--every", "0"], "--every"),
         (["preview", "none.usdc", "-o", "a.png", "--size", "²x3"], "--size ²x3"),
     ],
 )
@@ -710,6 +713,13 @@ def test_preview_makes_a_picture_of_a_run(warpjelly, tmp_path):
     assert code == 0
     assert str(picture) in out
     assert picture.read_bytes().startswith(b"\x89PNG")
-    code, _, err = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 3)
+    code, _, err = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 2)
+    assert code == 2
+    assert "--force" in one_line(err)
+    code, _, err = warpjelly("preview", tmp_path / "run", "-o", picture, "--frame", 3, "--force")
     assert code == 2
     assert "0 to 2" in one_line(err)
+    for name, option in (("r.html", "--every=2"), ("p.png", "--plots")):
+        code, out, err = warpjelly("preview", tmp_path / "run", "-o", tmp_path / name, option)
+        assert (code, err) == (0, "")
+        assert re.fullmatch(rf"preview: .*{name} \([0-9.]+ MB\)\n", out)

@@ -15,6 +15,8 @@ from stages import cube_surface, make_scene, moved_surface, start_stage, write_s
 
 from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.preview import render_preview
+from warpjelly.stagefiles import open_stage
+from warpjelly.view import View
 
 SIZE = (320, 180)
 
@@ -75,7 +77,7 @@ def test_colors_follow_the_forces(tmp_path: Path) -> None:
     hues = []
     for force_range in ((100.0, 200.0), (0.0, 1e-3)):
         path = write_stage(tmp_path / "stage.usdc", make_scene(output={"force_range": force_range}))
-        render_preview(path, tmp_path / "p.png", frames=[5], size=SIZE)
+        render_preview(path, tmp_path / "p.png", frames=[5], size=SIZE, force=True)
         picture = pixels(tmp_path / "p.png")[: SIZE[1] * 5 // 6]
         hues.append(picture[colorful(picture)].mean(axis=0))
     low, high = hues
@@ -91,8 +93,8 @@ def test_shadow_falls_on_the_floor(tmp_path: Path) -> None:
     for name, center in (("far", -20.0), ("on", 0.0)):
         floor[0]["center"] = [0.0, center, 0.0]
         path = write_stage(tmp_path / f"{name}.usdc", make_scene(colliders=floor))
-        render_preview(path, tmp_path / "p.png", frames=[0], size=SIZE)
-        picture = pixels(tmp_path / "p.png")
+        render_preview(path, tmp_path / f"{name}.png", frames=[0], size=SIZE)
+        picture = pixels(tmp_path / f"{name}.png")
         dark = ~colorful(picture) & (picture.max(axis=2) < 0.65)
         darkened.append(dark[: SIZE[1] * 5 // 6].sum())
     far, on = darkened
@@ -126,6 +128,84 @@ def test_hardest_impact_is_the_default(tmp_path: Path, color: str) -> None:
     render_preview(tmp_path, tmp_path / "default.png", size=SIZE)
     render_preview(tmp_path, tmp_path / "hardest.png", frames=[2], size=SIZE)
     np.testing.assert_array_equal(pixels(tmp_path / "default.png"), pixels(tmp_path / "hardest.png"))
+
+
+@pytest.mark.egl
+def test_no_frame_shows_those_before(tmp_path: Path) -> None:
+    """Render a frame after others exactly as by itself, its shadow included."""
+    stage = open_stage(write_stage(tmp_path / "stage.usdc"))
+    with View(stage, SIZE) as view:
+        after = [view.render(frame) for frame in (9, 0, 4)][-1]
+    with View(stage, SIZE) as view:
+        np.testing.assert_array_equal(view.render(4), after)
+
+
+def frames_of(movie: Path) -> np.ndarray:
+    """Return the frames of a movie, float [frame_count, height, width, 3] in 0 to 1, decoded by ffmpeg."""
+    from imageio_ffmpeg import read_frames
+
+    reader = read_frames(str(movie))
+    width, height = next(reader)["size"]
+    return np.array([np.frombuffer(frame, np.uint8).reshape(height, width, 3) for frame in reader]) / 255
+
+
+@pytest.mark.egl
+def test_movie_shows_every_frame_in_real_time(tmp_path: Path) -> None:
+    """Make an MP4 that every browser plays, of even size, with the frames' pictures, as long as the motion."""
+    from imageio_ffmpeg import read_frames
+
+    path, movie, done = write_stage(tmp_path / "stage.usdc"), tmp_path / "m.mp4", []
+    render_preview(path, movie, size=(321, 179), progress=lambda count, total: done.append((count, total)))
+    about = next(read_frames(str(movie)))
+    assert (about["codec"], about["pix_fmt"].partition("(")[0]) == ("h264", "yuv420p")
+    assert (about["size"], about["fps"]) == ((322, 180), 24.0)
+    assert about["duration"] == pytest.approx(10 / 24, abs=0.02)
+    assert done == [(count, 10) for count in range(1, 11)]
+    shown = frames_of(movie)
+    assert len(shown) == 10
+    for frame in (0, 9):
+        render_preview(path, tmp_path / f"{frame}.png", frames=[frame], size=(322, 180))
+        assert np.abs(shown[frame] - pixels(tmp_path / f"{frame}.png")).mean() < 0.02
+    assert np.abs(shown[0] - shown[9]).mean() > 0.05
+
+
+@pytest.mark.egl
+def test_thinned_movie_keeps_its_pace(tmp_path: Path) -> None:
+    """Show every third frame from the first to the last asked for, each for three frames' time, in a WebP for ever."""
+    from PIL import Image
+
+    path = write_stage(tmp_path / "stage.usdc")
+    render_preview(path, tmp_path / "m.webp", frames=[1, 8], every=3, size=(160, 90))
+    with Image.open(tmp_path / "m.webp") as movie:
+        assert (movie.format, movie.size, movie.n_frames, movie.info["loop"]) == ("WEBP", (160, 90), 3, 0)
+        durations = []
+        for number in range(movie.n_frames):
+            movie.seek(number)
+            movie.load()
+            durations.append(movie.info["duration"])
+    np.testing.assert_allclose(durations, 3 / 24 * 1000, atol=1)
+
+
+def test_more_frames_than_movies_show_are_refused(tmp_path: Path) -> None:
+    """Say how to thin the frames of a stage that has very many a second."""
+    path = write_stage(tmp_path / "stage.usdc", make_scene(fps=2000.0))
+    with pytest.raises(InputError, match=r"1000 frames a second .* --every 17"):
+        render_preview(path, tmp_path / "m.webp", every=2)
+
+
+@pytest.mark.egl
+def test_failing_encoder_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Say in one line that ffmpeg failed and why, and leave no movie behind."""
+    import imageio_ffmpeg
+
+    encoder = tmp_path / "ffmpeg"
+    encoder.write_text("#!/bin/sh\necho no space >&2\nexit 1\n")
+    encoder.chmod(0o755)
+    monkeypatch.setattr(imageio_ffmpeg, "get_ffmpeg_exe", lambda: str(encoder))
+    path = write_stage(tmp_path / "stage.usdc")
+    with pytest.raises(EnvironmentFailedError, match=r"m\.mp4: cannot write the preview: ffmpeg: no space"):
+        render_preview(path, tmp_path / "m.mp4", size=SIZE)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["ffmpeg", "stage.usdc"]
 
 
 @pytest.mark.egl
@@ -176,17 +256,13 @@ def test_missing_egl_is_explained(tmp_path: Path) -> None:
     assert said.stderr == ""
 
 
-def test_missing_pyvista_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Name the extra that brings pyvista."""
-    monkeypatch.setitem(sys.modules, "pyvista", None)
-    with pytest.raises(InputError, match=r"pip install 'warpjelly\[preview\]'"):
-        render_preview(write_stage(tmp_path / "stage.usdc"), tmp_path / "p.png")
-
-
 @pytest.mark.parametrize(
     ("output", "frames", "size", "what"),
     [
-        ("p.jpg", None, SIZE, "ends in .png"),
+        ("p.jpg", None, SIZE, r"ends in \.png, \.mp4"),
+        ("p.mp4", [1], SIZE, "first to the second of two --frame"),
+        ("p.mp4", [5, 3], SIZE, "first to the second of two --frame"),
+        ("p.webp", [1, 10], SIZE, "no frame 10; frames are 0 to 9"),
         ("p.png", [10], SIZE, "no frame 10; frames are 0 to 9"),
         ("p.png", [0, -1], SIZE, "no frame -1; frames are 0 to 9"),
         ("p.png", [], SIZE, "no frame to show"),
@@ -202,6 +278,29 @@ def test_wrong_arguments_are_explained(
     with pytest.raises(InputError, match=what):
         render_preview(path, tmp_path / output, frames=frames, size=size)
     assert not (tmp_path / output).exists()
+
+
+@pytest.mark.parametrize(("output", "every"), [("p.png", 2), ("p.mp4", 0)])
+def test_wrong_thinning_is_explained(tmp_path: Path, output: str, every: int) -> None:
+    """Refuse to thin single frames, and by nothing."""
+    with pytest.raises(InputError, match="every"):
+        render_preview(write_stage(tmp_path / "stage.usdc"), tmp_path / output, every=every)
+
+
+def test_file_that_is_there_is_kept(tmp_path: Path) -> None:
+    """Refuse to replace a file unless told to."""
+    (tmp_path / "p.png").write_text("mine")
+    with pytest.raises(InputError, match=r"p\.png: there already; .*--force"):
+        render_preview(write_stage(tmp_path / "stage.usdc"), tmp_path / "p.png")
+    assert (tmp_path / "p.png").read_text() == "mine"
+
+
+@pytest.mark.parametrize(("module", "output"), [("pyvista", "p.png"), ("imageio_ffmpeg", "p.mp4")])
+def test_missing_extra_is_explained(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, output: str) -> None:
+    """Name the extra that brings what is missing, before anything is rendered."""
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(InputError, match=r"pip install 'warpjelly\[preview\]'"):
+        render_preview(write_stage(tmp_path / "stage.usdc"), tmp_path / output)
 
 
 def test_missing_stage_is_explained(tmp_path: Path) -> None:

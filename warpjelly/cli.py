@@ -10,7 +10,7 @@ import signal
 import sys
 import tomllib
 import traceback
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from operator import itemgetter
 from pathlib import Path
@@ -296,25 +296,53 @@ def pack(
 @app.command()
 def preview(
     source: Annotated[Path, typer.Argument(metavar="RUN_OR_STAGE", help="Run directory or stage.", show_default=False)],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Picture to write, .png.", show_default=False)],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", help="File to write: .png, .mp4, .webp or .html.", show_default=False)
+    ],
     frames: Annotated[
         list[int],
         typer.Option(
             "--frame",
-            help="Frame to show; repeat it for several side by side. The moment of the hardest impact unless given.",
+            help="In a picture, a frame to show, repeated for several side by side; the moment of the hardest impact "
+            "unless given. In a movie or page, given twice, the first and the last; all unless given.",
             show_default=False,
         ),
     ] = [],  # noqa: B006
-    size: Annotated[str, typer.Option(metavar="WxH", help="Size of a frame in pixels.")] = "960x540",
+    every: Annotated[int, typer.Option(min=1, help="In a movie or page, show every so many frames.")] = 1,
+    size: Annotated[
+        str | None,
+        typer.Option(
+            metavar="WxH",
+            help="Size in pixels of a frame, 960x540 unless given, or of plots, 1400x800.",
+            show_default=False,
+        ),
+    ] = None,
+    plots: Annotated[
+        bool, typer.Option("--plots", help="Plot the run's metrics over time: energies, momentum, contacts ...")
+    ] = False,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
 ) -> None:
-    """Look at a result without a USD viewer."""
-    if not (sides := re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size)):
+    """Look at a result without a USD viewer.
+
+    The name of the file says as what: a picture (.png), a movie in real time (.mp4, .webp), or a page to look around
+    in, which plays from disk in any browser (.html).
+    """
+    sides = re.fullmatch(r"([0-9]{1,9})x([0-9]{1,9})", size or ("1400x800" if plots else "960x540"))
+    if not sides:
         raise InputError(f"--size {size}: give width x height in pixels, for example 960x540")
+    pixels = int(sides[1]), int(sides[2])
+    if plots:
+        if frames or every != 1:
+            raise InputError("--plots shows all frames: leave out --frame and --every")
+        from .plots import plot_metrics
 
-    from .preview import render_preview
+        plot_metrics(source, output, size=pixels, force=force)
+    else:
+        from .preview import render_preview
 
-    render_preview(source, output, frames=frames or None, size=(int(sides[1]), int(sides[2])))
-    print(f"picture: {output}")
+        with _progress("rendering") as show:
+            render_preview(source, output, frames=frames or None, every=every, size=pixels, force=force, progress=show)
+    print(f"preview: {output} ({output.stat().st_size / 1e6:.1f} MB)")
 
 
 @app.command()
@@ -357,7 +385,10 @@ def doctor() -> None:
         print("  no CUDA device; simulations run on the CPU")
     print(f"kernel cache: {wp.config.kernel_cache_dir}")
     print("optional parts:")
-    for extra, modules in [("preview", ["pyvista"]), ("formats", ["lxml", "networkx", "collada"])]:
+    for extra, modules in [
+        ("preview", ["pyvista", "PIL", "imageio_ffmpeg", "matplotlib"]),
+        ("formats", ["lxml", "networkx", "collada"]),
+    ]:
         missing = "" if all(map(util.find_spec, modules)) else f"missing: pip install 'warpjelly[{extra}]'"
         print(f"  {extra:<10} {missing or 'present'}")
 
@@ -371,6 +402,19 @@ def main() -> None:
     # Termination is an interruption like Ctrl-C: the frames that were finished are saved.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(_guarded())
+
+
+@contextmanager
+def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
+    """Give a function that shows how much is done, of how much; only on a terminal."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    console, off = Console(stderr=True), not sys.stderr.isatty()
+    with Progress(*columns, TextColumn("left"), console=console, disable=off, transient=True) as bar:
+        task = bar.add_task(what, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def _guarded() -> int:

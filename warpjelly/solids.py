@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from pxr import Usd, UsdGeom, UsdShade
+from pxr import Sdf, Usd, UsdGeom, UsdShade
 
 from .colors import srgb_from_linear
+from .errors import InputError
 from .looks import Texture
 from .usdlooks import read_look
 
@@ -50,49 +51,125 @@ def shapes_in(stage: Usd.Stage, schema: Any) -> Iterator[Any]:
     return (schema(prim) for prim in stage.Traverse() if prim.IsA(schema))
 
 
-def draw_stage(pyvista: Any, stage: Usd.Stage, frame: int) -> Drawn:
-    """Return what is to be seen of a stage at a frame."""
-    transforms = UsdGeom.XformCache(frame)
-    drawn = Drawn()
+def the_camera(stage: Usd.Stage) -> UsdGeom.Camera:
+    """Return a stage's first camera."""
+    camera = next(shapes_in(stage, UsdGeom.Camera), None)
+    if camera is None:
+        raise InputError("the stage has no camera")
+    return camera
 
-    def placed(shape: Any, surface: pv.PolyData) -> pv.PolyData:
-        return surface.transform(np.array(transforms.GetLocalToWorldTransform(shape.GetPrim())).T, inplace=False)
 
-    for mesh in shapes_in(stage, UsdGeom.Mesh):
-        for solid in _mesh_solids(pyvista, mesh, frame):
-            surface = placed(mesh, solid.surface)
-            if surface.n_cells == 1:
-                drawn.floors.append(surface)
-            else:
-                drawn.solids.append(replace(solid, surface=surface))
-    for sphere in shapes_in(stage, UsdGeom.Sphere):
-        ball = pyvista.Sphere(radius=sphere.GetRadiusAttr().Get(frame), theta_resolution=96, phi_resolution=96)
-        ball["color"] = _colors(sphere, frame, ball.n_points)
-        drawn.solids.append(Solid(placed(sphere, ball)))
-    for curves in shapes_in(stage, UsdGeom.BasisCurves):
-        points = np.array(curves.GetPointsAttr().Get(frame)).reshape(-1, 3)
-        lines = placed(curves, pyvista.line_segments_from_points(points))
-        interpolation = curves.GetDisplayColorPrimvar().GetInterpolation()
-        if interpolation == UsdGeom.Tokens.constant:
-            drawn.rooms.append(lines)
-            continue
-        lines["color"] = _colors(curves, frame, len(points))
-        tubes = lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True)
-        drawn.solids.append(Solid(tubes, shows_force=interpolation == UsdGeom.Tokens.vertex))
-    for balls in shapes_in(stage, UsdGeom.Points):
-        drawn.solids.append(Solid(placed(balls, _balls(pyvista, balls, frame)), shows_force=True))
-    return drawn
+def room_floor(stage: Usd.Stage, points: np.ndarray) -> np.ndarray:
+    """Return the corners [4, 3] of the rectangle at the bottom of a room, given points [n, 3] of its edges, m."""
+    up = 2 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else 1
+    low, high = points.min(axis=0), points.max(axis=0)
+    side, other = np.eye(3)[(up + 1) % 3] * (high - low), np.eye(3)[(up + 2) % 3] * (high - low)
+    return np.array([low, low + side, low + side + other, low + other])
+
+
+class StageDrawing:
+    """Draws the frames of a stage; materials are read once."""
+
+    def __init__(self, pyvista: Any, stage: Usd.Stage) -> None:
+        self._pyvista, self._stage = pyvista, stage
+        self._looks: dict[Sdf.Path, tuple[Any, pv.Texture | None]] = {}
+
+    def at(self, frame: int) -> Drawn:
+        """Return what is to be seen at a frame; the shapes are as many, and in the same order, at each."""
+        transforms = UsdGeom.XformCache(frame)
+        drawn = Drawn()
+
+        def placed(shape: Any, surface: pv.PolyData) -> pv.PolyData:
+            matrix = np.array(transforms.GetLocalToWorldTransform(shape.GetPrim())).T
+            return surface if (matrix == np.eye(4)).all() else surface.transform(matrix, inplace=False)
+
+        for mesh in shapes_in(self._stage, UsdGeom.Mesh):
+            for solid in self._mesh_solids(mesh, frame):
+                surface = placed(mesh, solid.surface)
+                if surface.n_cells == 1:
+                    drawn.floors.append(surface)
+                else:
+                    drawn.solids.append(replace(solid, surface=surface))
+        for sphere in shapes_in(self._stage, UsdGeom.Sphere):
+            radius = sphere.GetRadiusAttr().Get(frame)
+            ball = self._pyvista.Sphere(radius=radius, theta_resolution=96, phi_resolution=96)
+            _color(ball, colors_at(sphere, frame, ball.n_points))
+            drawn.solids.append(Solid(placed(sphere, ball)))
+        for curves in shapes_in(self._stage, UsdGeom.BasisCurves):
+            points = np.array(curves.GetPointsAttr().Get(frame)).reshape(-1, 3)
+            lines = placed(curves, self._pyvista.line_segments_from_points(points))
+            interpolation = curves.GetDisplayColorPrimvar().GetInterpolation()
+            if interpolation == UsdGeom.Tokens.constant:
+                drawn.rooms.append(lines)
+                continue
+            lines["color"] = colors_at(curves, frame, len(points))
+            tubes = lines.tube(radius=curves.GetWidthsAttr().Get(frame)[0] / 2, n_sides=12, capping=True)
+            drawn.solids.append(Solid(tubes, shows_force=interpolation == UsdGeom.Tokens.vertex))
+        for balls in shapes_in(self._stage, UsdGeom.Points):
+            drawn.solids.append(Solid(placed(balls, _balls(self._pyvista, balls, frame)), shows_force=True))
+        return drawn
+
+    def _mesh_solids(self, mesh: UsdGeom.Mesh, frame: int) -> Iterator[Solid]:
+        """Yield the parts of a mesh that have different materials."""
+        points = np.array(mesh.GetPointsAttr().Get(frame)).reshape(-1, 3)
+        counts = np.array(mesh.GetFaceVertexCountsAttr().Get(frame))
+        corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
+        subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
+        if not subsets:
+            normals = mesh.GetNormalsAttr().Get(frame)
+            by_corner = _by_corner(mesh, "normals", frame)
+            if by_corner is None:
+                surface = _polygons(self._pyvista, points, counts, corners)
+                if normals is not None and len(normals) == len(points):
+                    surface.point_data.active_normals = np.array(normals)
+                _color(surface, colors_at(mesh, frame, len(points)))
+                by_point = mesh.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.vertex
+                yield Solid(surface, shows_force=by_point)
+                return
+        # VTK has normals and texture coordinates for points alone, so every corner becomes one.
+        own = np.full(len(counts), len(subsets))
+        for number, subset in enumerate(subsets):
+            own[np.array(subset.GetIndicesAttr().Get(), int)] = number
+        colors, uvs = colors_at(mesh, frame, len(points)), _by_corner(mesh, "st", frame)
+        normals = _by_corner(mesh, "normals", frame)
+        for number in np.unique(own).tolist():
+            at = np.repeat(own == number, counts)
+            own_corners = np.arange(np.count_nonzero(at))
+            surface = _polygons(self._pyvista, points[corners[at]], counts[own == number], own_corners)
+            if normals is not None:
+                surface.point_data.active_normals = normals[at]
+            value, image = self._look(subsets[number].GetPrim()) if number < len(subsets) else (None, None)
+            if isinstance(value, Texture) and uvs is not None:
+                surface.active_texture_coordinates = _placed_uvs(value, uvs[at])
+                yield Solid(surface, texture=image)
+                continue
+            plain = _GREY if isinstance(value, Texture) else value
+            _color(surface, colors[corners[at]] if value is None else _bytes(plain, at.sum()))
+            yield Solid(surface, shows_force=value is None)
+
+    def _look(self, prim: Usd.Prim) -> tuple[Any, pv.Texture | None]:
+        """Return the diffuse colour of a prim, and its image if it is a texture."""
+        path = prim.GetPath()
+        if path not in self._looks:
+            value = diffuse(prim)
+            self._looks[path] = value, _image(self._pyvista, value) if isinstance(value, Texture) else None
+        return self._looks[path]
 
 
 def _balls(pyvista: Any, shape: UsdGeom.Points, frame: int) -> pv.PolyData:
     points = np.array(shape.GetPointsAttr().Get(frame)).reshape(-1, 3)
     cloud = pyvista.PolyData(points)
-    cloud["color"] = _colors(shape, frame, len(points))
+    cloud["color"] = colors_at(shape, frame, len(points))
     ball = pyvista.Icosphere(radius=shape.GetWidthsAttr().Get(frame)[0] / 2, nsub=2)
     return cloud.glyph(geom=ball, scale=False, orient=False)
 
 
-def _colors(shape: UsdGeom.Gprim, frame: int, count: int) -> np.ndarray:
+def _color(surface: pv.PolyData, colors: np.ndarray) -> None:
+    """Give a surface the sRGB colour of each point, uint8 [point_count, 3]."""
+    surface.point_data.set_scalars(colors, "color")
+
+
+def colors_at(shape: UsdGeom.Gprim, frame: int, count: int) -> np.ndarray:
     """Return the colour of every point, sRGB, uint8 [count, 3]; grey where the stage has none by point."""
     linear = UsdGeom.Primvar(shape.GetDisplayColorAttr()).ComputeFlattened(frame)
     colors = np.array([_GREY] if linear is None or not len(linear) else linear)
@@ -108,46 +185,6 @@ def _bytes(linear: Any, count: int) -> np.ndarray:
     return np.broadcast_to(colors, (count, 3)).copy()
 
 
-def _mesh_solids(pyvista: Any, mesh: UsdGeom.Mesh, frame: int) -> Iterator[Solid]:
-    """Yield the parts of a mesh that have different materials."""
-    points = np.array(mesh.GetPointsAttr().Get(frame)).reshape(-1, 3)
-    counts = np.array(mesh.GetFaceVertexCountsAttr().Get(frame))
-    corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
-    subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
-    if not subsets:
-        normals = mesh.GetNormalsAttr().Get(frame)
-        by_corner = _by_corner(mesh, "normals", frame)
-        if by_corner is None:
-            surface = _polygons(pyvista, points, counts, corners)
-            if normals is not None and len(normals) == len(points):
-                surface.point_data.active_normals = np.array(normals)
-            surface["color"] = _colors(mesh, frame, len(points))
-            by_point = mesh.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.vertex
-            yield Solid(surface, shows_force=by_point)
-            return
-    # VTK has normals and texture coordinates for points alone, so every corner becomes one.
-    own = np.full(len(counts), len(subsets))
-    for number, subset in enumerate(subsets):
-        own[np.array(subset.GetIndicesAttr().Get(), int)] = number
-    colors, uvs = _colors(mesh, frame, len(points)), _by_corner(mesh, "st", frame)
-    normals = _by_corner(mesh, "normals", frame)
-    for number in np.unique(own).tolist():
-        at = np.repeat(own == number, counts)
-        surface = _polygons(pyvista, points[corners[at]], counts[own == number], np.arange(np.count_nonzero(at)))
-        if normals is not None:
-            surface.point_data.active_normals = normals[at]
-        value = _diffuse(subsets[number].GetPrim()) if number < len(subsets) else None
-        if isinstance(value, Texture) and uvs is not None:
-            surface.active_texture_coordinates = _placed_uvs(value, uvs[at])
-            yield Solid(surface, texture=_image(pyvista, value))
-            continue
-        shown = (
-            colors[corners[at]] if value is None else _bytes(_GREY if isinstance(value, Texture) else value, at.sum())
-        )
-        surface["color"] = shown
-        yield Solid(surface, shows_force=value is None)
-
-
 def _polygons(pyvista: Any, points: np.ndarray, counts: np.ndarray, corners: np.ndarray) -> pv.PolyData:
     # VTK wants each face's number of corners in front of them.
     return pyvista.PolyData(points, faces=np.insert(corners, np.cumsum(counts) - counts, counts))
@@ -161,7 +198,7 @@ def _by_corner(mesh: UsdGeom.Mesh, name: str, frame: int) -> np.ndarray | None:
     return np.array(primvar.ComputeFlattened(frame))
 
 
-def _diffuse(prim: Usd.Prim) -> Any:
+def diffuse(prim: Usd.Prim) -> Any:
     """Return the diffuse colour of a prim's material: linear, or a texture; None where it has no look of its own."""
     material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
     look = read_look(Path(prim.GetStage().GetRootLayer().realPath), material, {}) if material else None
@@ -177,16 +214,23 @@ def _placed_uvs(texture: Texture, uvs: np.ndarray) -> np.ndarray:
     return ((uvs * placing.scale) @ turn.T + placing.translation).astype(np.float32)
 
 
-def _image(pyvista: Any, texture: Texture) -> pv.Texture:
-    from PIL import Image
-
+def texture_pixels(texture: Texture) -> np.ndarray:
+    """Return the colours of a texture, sRGB, uint8 [height, width, 3], from its upper left on."""
+    try:
+        from PIL import Image
+    except ImportError as error:
+        raise InputError("textures need Pillow: pip install 'warpjelly[preview]'") from error
     with Image.open(BytesIO(texture.data)) as picture:
         pixels = np.asarray(picture.convert("RGB")) / 255.0
     if not texture.srgb:
         pixels = srgb_from_linear(pixels)
     scaled = np.clip(pixels * texture.scale[:3] + texture.bias[:3], 0.0, 1.0)
+    return np.rint(scaled * 255).astype(np.uint8)
+
+
+def _image(pyvista: Any, texture: Texture) -> pv.Texture:
     # A picture starts at its upper left, a texture at its lower left.
-    image = pyvista.numpy_to_texture(np.ascontiguousarray(np.rint(scaled * 255).astype(np.uint8)[::-1]))
+    image = pyvista.numpy_to_texture(np.ascontiguousarray(texture_pixels(texture)[::-1]))
     image.repeat = texture.wrap[0] == "repeat"
     image.mipmap = image.interpolate = True
     return image

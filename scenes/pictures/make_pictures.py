@@ -1,4 +1,4 @@
-"""Make the pictures of the README: run each scene and show some of its frames side by side.
+"""Make the pictures of the README: run each scene and show some of its frames side by side, and one as a movie.
 
 python scenes/pictures/make_pictures.py [SCENE ...]
 """
@@ -13,7 +13,7 @@ import warpjelly as wj
 from warpjelly.preview import render_preview
 
 HERE = Path(__file__).parent
-SIZE = (420, 340)
+SIZE, MOVIE_SIZE = (420, 340), (800, 450)
 GAP = 4
 # The frames that tell a scene's story.
 FRAMES = {
@@ -28,15 +28,20 @@ FRAMES = {
     "pile": [0, 22, 36, 60, 119],
     "falling_cloth": [0, 17, 24, 35, 149],
 }
+# The scene that the README starts with moves: its first and last frame.
+MOVIES = {"tree_drop": [0, 239]}
 # The same moment of several scenes.
 COMPARED = {"couplers": (["coupler_7", "coupler_8", "coupler_drop", "coupler_40"], 13)}
 
 
 def show(scene: str, frames: list[int], picture: Path) -> None:
-    """Run a scene and write some of its frames into a PNG."""
+    """Run a scene and write some of its frames into a PNG, and all beside it where the scene is one of the movies."""
     with tempfile.TemporaryDirectory() as folder:
         wj.simulate(wj.load_scene(HERE.parent / f"{scene}.toml"), output=folder)
-        render_preview(Path(folder), picture, frames=frames, size=SIZE)
+        render_preview(Path(folder), picture, frames=frames, size=SIZE, force=True)
+        if scene in MOVIES:
+            movie = picture.with_suffix(".webp")
+            render_preview(Path(folder), movie, frames=MOVIES[scene], every=2, size=MOVIE_SIZE, force=True)
 
 
 def main(chosen: list[str]) -> None:
