@@ -220,8 +220,11 @@ def texture_pixels(texture: Texture) -> np.ndarray:
         from PIL import Image
     except ImportError as error:
         raise InputError("textures need Pillow: pip install 'warpjelly[preview]'") from error
-    with Image.open(BytesIO(texture.data)) as picture:
-        pixels = np.asarray(picture.convert("RGB")) / 255.0
+    try:
+        with Image.open(BytesIO(texture.data)) as picture:
+            pixels = np.asarray(picture.convert("RGB")) / 255.0
+    except OSError as error:
+        raise InputError(f"the texture {texture.name} is not an image that can be read") from error
     if not texture.srgb:
         pixels = srgb_from_linear(pixels)
     scaled = np.clip(pixels * texture.scale[:3] + texture.bias[:3], 0.0, 1.0)
@@ -229,8 +232,7 @@ def texture_pixels(texture: Texture) -> np.ndarray:
 
 
 def _image(pyvista: Any, texture: Texture) -> pv.Texture:
-    # A picture starts at its upper left, a texture at its lower left.
-    image = pyvista.numpy_to_texture(np.ascontiguousarray(texture_pixels(texture)[::-1]))
+    image = pyvista.numpy_to_texture(texture_pixels(texture))
     image.repeat = texture.wrap[0] == "repeat"
     image.mipmap = image.interpolate = True
     return image

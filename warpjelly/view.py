@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 # Directions towards the lights in the axes (right, up, backward) of the camera, and how strong they are.
 _KEY = np.array([-0.45, 0.8, 0.45])
 _LIGHTS = ((_KEY, 0.7), (np.array([0.5, 0.1, 1.0]), 0.4), (np.array([0.5, 0.6, -0.8]), 0.35))
+# Points of a solid that throw shadows, at most about.
+_MAX_SAMPLES = 1_000_000
 # Jelly lets light through where it is thin, which is where one looks along its surface.
 _LIGHT_STEP = "//VTK::Light::Impl"
 _GLOW = f"{_LIGHT_STEP}\n  fragOutput0.rgb += 0.4 * pow(1.0 - abs(normalVCVSOutput.z), 2.0) * diffuseColor;\n"
@@ -168,6 +170,8 @@ def _sampled(solid: pv.PolyData, spacing: float) -> np.ndarray:
     triangles = solid.triangulate()
     corners = np.asarray(triangles.points)[triangles.regular_faces]
     longest = float(np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max())
-    count = int(np.clip(np.ceil(longest / spacing), 1, 64))
+    # Each triangle gets about half the square of this count; the tubes of springs have very many.
+    most = min(64.0, np.sqrt(2 * _MAX_SAMPLES / len(corners)))
+    count = int(np.clip(np.ceil(longest / spacing), 1, max(most, 1)))
     u, v = np.array([(i, j) for i in range(count + 1) for j in range(count + 1 - i)]).T / count
     return np.einsum("kc,tcd->tkd", np.stack([1 - u - v, u, v], axis=1), corners).reshape(-1, 3)
