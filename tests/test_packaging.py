@@ -72,10 +72,10 @@ def test_licence_field_and_file_agree() -> None:
 
 
 def test_wheel_holds_the_packages(site: Path) -> None:
-    """Install both packages, the type marker and the licence, and nothing at the top level besides."""
+    """Install both packages, their data and the licence, and nothing at the top level besides."""
     folders = {path.name for path in site.iterdir()}
     assert folders == {"warpjelly", "bin", f"warpjelly-{PYPROJECT['project']['version']}.dist-info"}
-    assert (site / "warpjelly" / "py.typed").is_file()
+    assert all((site / "warpjelly" / name).is_file() for name in ("py.typed", "review.html"))
     assert list(site.glob("*.dist-info/licenses/LICENSE"))
     for package, folder in (("warpjelly", "warpjelly"), ("warpjelly/kernels", "kernels")):
         installed = {path.name for path in (site / package).glob("*.py")}
