@@ -108,3 +108,11 @@ def test_grid_files_are_numpy_files(tmp_path, monkeypatch, at_once: int) -> None
     np.savez(path, cells=numbers)
     np.testing.assert_array_equal(read_grid(path, 2)[0].dense(), numbers == 2)
     assert not read_grid(path, 300)[0].count
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_cells_know_which_they_are(seed: int) -> None:
+    """Ask for every cell of a random grid and for those around it."""
+    dense = np.random.default_rng(seed).random((4, 3, 5)) < 0.5
+    asked = np.array(list(np.ndindex(6, 5, 7))) - 1
+    np.testing.assert_array_equal(Cells.of(dense).has(asked), np.pad(dense, 1).ravel())

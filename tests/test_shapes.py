@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections import Counter
 from pathlib import Path
 from typing import Any
@@ -23,7 +25,7 @@ from warpjelly.preview import render_preview
 from warpjelly.run import simulate
 from warpjelly.scene import Output
 from warpjelly.shading import shared_normals
-from warpjelly.shapes import Shape, at_rest, shapes_of
+from warpjelly.shapes import Shape, at_rest, face_edges, shapes_of
 from warpjelly.simulator import Simulator
 from warpjelly.stagefiles import open_stage
 from warpjelly.validate import stage_problems
@@ -332,6 +334,82 @@ def test_a_stage_has_the_uvs_and_materials_of_the_model(tmp_path: Path, look: st
     (tmp_path / "run" / "textures" / "red.png").unlink()
     (problem,) = stage_problems(tmp_path / "run")
     assert "textures/red.png" in problem
+
+
+def test_pieces_that_are_dropped_are_not_shown(tmp_path: Path) -> None:
+    """Keep of two balls the larger one alone, and with it the crumb that touches its cells."""
+    balls = [trimesh.creation.icosphere(subdivisions=2, radius=radius) for radius in (0.5, 0.3, 0.02)]
+    balls[1].apply_translation([3.0, 0.0, 0.0])
+    balls[2].apply_translation([0.0, 0.55, 0.0])
+    trimesh.util.concatenate(balls).export(tmp_path / "balls.ply")
+    shown = {}
+    for pieces in ("all", "largest"):
+        scene = model_scene(tmp_path / "balls.ply")
+        body = scene.bodies[0].model_copy(update={"resolution": 20, "pieces": pieces})
+        (shape,), (sample,) = (
+            (simulator := Simulator(scene.model_copy(update={"bodies": [body]}), device="cpu")).model.shapes,
+            simulator.shapes(),
+        )
+        assert shape.corners.max() < len(sample.points)
+        shown[pieces] = sample.points
+    assert len(shown["all"]) == sum(len(ball.vertices) for ball in balls)
+    assert len(shown["largest"]) == len(balls[0].vertices) + len(balls[2].vertices)
+    assert shown["largest"][:, 0].max() < 0.6 < shown["all"][:, 0].max()
+
+
+def test_edges_of_faces_are_those_of_squares() -> None:
+    """Count the edges of the faces of two cubes side by side, each once: 20 of 12 vertices."""
+    lattice = build_lattice(Cells.of(np.ones((2, 1, 1), bool)), origin=np.zeros(3), cell_size=1.0)
+    shape = face_edges("two", lattice)
+    ends = lattice.particles[shape.particles[:, 0]].reshape(-1, 2, 3)
+    assert len(ends) == 20
+    np.testing.assert_allclose(np.linalg.norm(ends[:, 1] - ends[:, 0], axis=1), 1.0)
+
+
+@pytest.mark.egl
+def test_textures_are_shown_the_right_way_up(tmp_path: Path) -> None:
+    """Find the upper half of an image at the top, where v is 1."""
+    model = write_painted_box(tmp_path)
+    image = Image.new("RGB", (8, 8), (0, 0, 255))
+    image.paste((255, 0, 0), (0, 0, 8, 4))
+    image.save(tmp_path / "red.png")
+    lines = model.read_text().splitlines()
+    # Every side gets the image, v along y.
+    faces = [
+        "1/1 2/1 4/4 3/4",
+        "5/1 7/4 8/4 6/1",
+        "1/1 5/1 6/1 2/1",
+        "3/4 4/4 8/4 7/4",
+        "1/1 3/4 7/4 5/1",
+        "2/1 6/1 8/4 4/4",
+    ]
+    kept = [line for line in lines if not line.startswith(("f ", "usemtl")) and line]
+    model.write_text("\n".join([*kept, "usemtl painted", *(f"f {face}" for face in faces)]) + "\n")
+    simulate(model_scene(model), output=tmp_path / "run", device="cpu")
+    render_preview(tmp_path / "run", tmp_path / "p.png", frames=[0], size=(320, 240))
+    with Image.open(tmp_path / "p.png") as picture:
+        red, green, blue = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), 2, 0)
+    reds, blues = np.argwhere((red > 90) & (blue < red / 3)), np.argwhere((blue > 90) & (red < blue / 3))
+    assert len(reds) > 100 and len(blues) > 100
+    assert reds[:, 0].mean() < blues[:, 0].mean()
+
+
+@pytest.mark.egl
+def test_springs_over_a_floor_are_drawn_in_bounded_memory(tmp_path: Path) -> None:
+    """Throw shadows of thousands of springs with a limited number of points."""
+    body = {"type": "cube", "name": "cube", "material": "jelly", "particles_per_edge": 8, "position": [0.0, 1.0, 0.0]}
+    floor = {"type": "plane", "normal": [0.0, 1.0, 0.0], "size": [4.0, 4.0]}
+    scene = make_scene(bodies=[body], colliders=[floor], output={"show": ["springs"]}, frames=1)
+    simulate(scene, output=tmp_path / "run", device="cpu")
+    script = (
+        "import resource, sys; from pathlib import Path; from warpjelly.preview import render_preview\n"
+        "render_preview(Path(sys.argv[1]), Path(sys.argv[2]), size=(320, 180))\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
+    )
+    command = [sys.executable, "-c", script, str(tmp_path / "run"), str(tmp_path / "p.png")]
+    process = subprocess.run(command, check=True, capture_output=True, text=True)
+    # It takes about 0.6 GB, and took more than 20 GB where long thin triangles were filled like large ones.
+    assert int(process.stdout) < 2_000_000
 
 
 @pytest.mark.egl

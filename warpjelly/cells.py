@@ -82,6 +82,13 @@ class Cells:
         """Return events that count one in each occupied cell, int64 [2 run_count]."""
         return 2 * self.edges + np.tile([1, 0], self.run_count)
 
+    def has(self, cells: np.ndarray) -> np.ndarray:
+        """Say of cells [count, 3], int, whether each is occupied, bool [count]; outside of the grid none is."""
+        inside = ((cells >= 0) & (cells < self.shape)).all(axis=1)
+        x, y, z = cells.T
+        places = (x * self.shape[1] + y) * (self.shape[2] + 1) + z
+        return inside & (np.searchsorted(self.edges, places, side="right") % 2 == 1)
+
     def kept(self, runs: np.ndarray) -> Cells:
         """Return the cells of some runs alone, bool [run_count]."""
         return Cells(self.shape, self.edges[np.repeat(runs, 2)])

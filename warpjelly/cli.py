@@ -153,8 +153,13 @@ def check(
     if as_json:
         print(json.dumps(figures))
         return
-    print(f"{scene}: sound")
+    name = loaded.solver.integrator
+    limits = [figures[key][name] for key in ("dt_limit", "dt_limit_in_contact")]
+    stable = all(limit is not None and figures["dt"] <= limit for limit in limits)
+    print(f"{scene}: {'sound' if stable else 'sound, but for its time step: see the warning'}")
     print(f"  voxels     {figures['voxels']:>13,}")
+    if len(figures["materials"]) > 1:
+        print(f"  of which   {', '.join(f'{count:,} {name}' for name, count in figures['materials'].items())}")
     print(f"  particles  {figures['particles']:>13,}")
     print(f"  springs    {figures['springs']:>13,}")
     print(f"  memory     {figures['memory_bytes'] / 1e9:>13.2f} GB at the peak, about")
@@ -186,6 +191,12 @@ def voxelize(
     ] = None,
     prim: Annotated[
         str | None, typer.Option(help="Of a USD file, the prim below which to look.", show_default=False)
+    ] = None,
+    scale: Annotated[
+        float | None, typer.Option(help="Metres per unit of the model; 1 unless given.", show_default=False)
+    ] = None,
+    fit: Annotated[
+        float | None, typer.Option(help="Largest extent of the model, m, instead of --scale.", show_default=False)
     ] = None,
     method: Annotated[
         Literal["auto", "parity", "winding", "vote"], typer.Option(help="How cells are told to be inside.")
@@ -220,8 +231,7 @@ def voxelize(
     from .scenefile import read_scene
 
     options: dict[str, Any] = {"method": method, "keep_thin_parts": keep_thin_parts, "pieces": pieces}
-    if prim is not None:
-        options["prim"] = prim
+    options |= {key: value for key, value in (("prim", prim), ("scale", scale), ("fit", fit)) if value is not None}
     body = {"type": "model", "name": "model", "material": "jelly", "file": str(model.absolute()), **options}
     scene = read_scene({"materials": {"jelly": {}}, "bodies": [{**body, "resolution": resolution}]}, model)
     grid, lattice, figures = survey_model(scene)
@@ -230,10 +240,10 @@ def voxelize(
 
         write_grid(output, grid.cells, grid.origin, grid.cell_size)
     elif output is not None:
-        from .shapes import at_rest, shapes_of
+        from .shapes import at_rest, face_edges, shapes_of
         from .stagewriter import write_still
 
-        shapes = shapes_of("model", lattice, scene.output)
+        shapes = [*shapes_of("model", lattice, scene.output), face_edges("model", lattice)]
         write_still(output, scene=scene, shapes=shapes, rest=[at_rest(shape, lattice) for shape in shapes])
     if as_json:
         print(json.dumps(figures))

@@ -59,6 +59,9 @@ def read_gltf(path: Path) -> Model:
     data = path.read_bytes()
     body = b""
     if data.startswith(b"glTF"):
+        length = int.from_bytes(data[8:12], "little")
+        if len(data) < max(length, 20):
+            raise ValueError(f"it is cut off: {len(data):,} of {max(length, 20):,} bytes")
         # A header, a chunk of text and one of bytes; each chunk starts with its length and type.
         end = 20 + int.from_bytes(data[12:16], "little")
         data, body = data[20:end], data[end + 8 :]

@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import math
 import os
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
 from pathlib import Path
@@ -80,8 +81,8 @@ class BodyPlan:
     """One body, ready to be built."""
 
     body: AnyBody
-    materials: list[str]
-    """Names of its materials, in the order of the lattice."""
+    materials: dict[str, int]
+    """Number of jelly cubes of each of its materials, by name, in the order of the lattice."""
     build: Callable[[], Lattice]
     """Makes its particles, springs and surface."""
     particle_count: int
@@ -112,6 +113,14 @@ class Plan:
     def voxel_count(self) -> int:
         """Number of jelly cubes."""
         return sum(plan.voxel_count for plan in self.bodies)
+
+    @property
+    def materials(self) -> dict[str, int]:
+        """Number of jelly cubes of each material, by name; of those that bodies have."""
+        counts: Counter[str] = Counter()
+        for plan in self.bodies:
+            counts.update(plan.materials)
+        return dict(counts)
 
     @property
     def particle_count(self) -> int:
@@ -174,11 +183,11 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         build = partial(build_network, body.points, body.springs(), body.rest_lengths)
         springs = sum(map(len, body.springs()))
         shown = 2 * springs + len(body.points)
-        return BodyPlan(body, [body.material], build, len(body.points), springs, springs, shown)
+        return BodyPlan(body, {body.material: 0}, build, len(body.points), springs, springs, shown)
     if isinstance(body, ClothBody):
         particles = body.particles[0] * body.particles[1]
         build = partial(build_cloth, body.size, body.particles)
-        return BodyPlan(body, [body.material], build, particles, 6 * particles, 6 * particles, particles)
+        return BodyPlan(body, {body.material: 0}, build, particles, 6 * particles, 6 * particles, particles)
     model, triangles = None, 0
     regions: list[Cells] = []
     if isinstance(body, CubeBody):
@@ -216,7 +225,8 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
     }
     shown = sum(points[name] for name in set(scene.output.show))
     rows = _count_rows(cells, per_edge)
-    return BodyPlan(body, names, build, particles, springs, spans, shown, rows, cells.count, triangles, model)
+    cubes = {name: part.count for name, part in zip(names, materials, strict=True)}
+    return BodyPlan(body, cubes, build, particles, springs, spans, shown, rows, cells.count, triangles, model)
 
 
 def _count_rows(cells: Cells, particles_per_edge: int) -> int:
@@ -242,7 +252,11 @@ def _assign_materials(
     for number, (region, inside) in enumerate(zip(named, regions, strict=True)):
         selected = cells.within(inside)
         if not selected.count:
-            raise SceneError(f"bodies.{body.name}.regions.{number}: has no jelly cube of the body")
+            key = next(key for key in region.selectors if getattr(region, key) is not None)
+            raise SceneError(
+                f"bodies.{body.name}.regions.{number}.{key} = {getattr(region, key)!s}: has no jelly cube of the body; "
+                "is it inside of the body, and thick enough for the centre of a cube?"
+            )
         materials = {name: others.without(selected) for name, others in materials.items()}
         name = region.material
         materials[name] = materials[name].joined(selected) if name in materials else selected
@@ -330,7 +344,25 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
         else _cells_in_mesh(region, body, model, scale, grid, up_axis)
         for region in body.regions
     ]
+    if body.pieces == "largest":
+        model = _without_lost_pieces(model, grid)
     return VoxelizedModel(grid, closed, model, regions, volume, notes)
+
+
+def _without_lost_pieces(model: LoadedModel, grid: VoxelGrid) -> LoadedModel:
+    """Return a model without the pieces of its surface that have no cell of the grid in or beside them."""
+    from .polygons import joined
+    from .shading import components
+
+    faces, mesh = model.mesh.faces, model.mesh
+    piece = components(len(mesh.vertices), np.concatenate([faces[:, 0], faces[:, 1]]), faces[:, [1, 2]].T.ravel())
+    cells = np.floor((mesh.vertices - grid.origin) / grid.cell_size).astype(int)
+    steps = np.array(list(np.ndindex(3, 3, 3))) - 1
+    near = np.any([grid.cells.has(cells + step) for step in steps], axis=0)
+    kept = np.isin(piece[faces[:, 0]], piece[near])
+    polygons = np.zeros(len(model.drawing.counts), bool)
+    polygons[model.mesh_polygons[kept]] = True
+    return replace(model, drawing=joined([model.drawing.taken(polygons)]))
 
 
 def _cells_in_mesh(

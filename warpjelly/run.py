@@ -296,8 +296,8 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     """Build a scene, step it for a moment, and say what a run of it takes.
 
     Returns:
-        ``particles, springs, voxels``; ``memory_bytes``, an estimate of the peak, and ``body_memory_bytes``, of
-        each body by name; ``dt`` [s], ``substeps`` a frame,
+        ``particles, springs, voxels``; ``materials``, the number of voxels of each by name; ``memory_bytes``, an
+        estimate of the peak, and ``body_memory_bytes``, of each body by name; ``dt`` [s], ``substeps`` a frame,
         ``frames``; ``dt_limit`` and ``dt_limit_in_contact``, the largest stable step by integrator, s or None;
         ``seconds``, an estimate from this machine's speed now; ``device``.
 
@@ -328,6 +328,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     return {
         "scene": scene.name,
         "voxels": sim.model.voxel_count,
+        "materials": plan.materials,
         "particles": sim.model.particle_count,
         "springs": sim.model.spring_count,
         "memory_bytes": plan.memory_bytes,

@@ -208,7 +208,7 @@ class Region(Table):
     @model_validator(mode="after")
     def _one_way_is_chosen(self) -> Self:
         if sum(getattr(self, key) is not None for key in self.selectors) != 1:
-            raise PydanticCustomError("region", f"give {' or '.join(self.selectors)}")
+            raise PydanticCustomError("region", f"give one of {', '.join(self.selectors)}")
         return self
 
 
@@ -828,6 +828,12 @@ class Output(Table):
     )
     velocities: Switch = Field(False, description="write point velocities, for motion blur")
     forces: Switch = Field(False, description="write the force on each point, N, as primvars:force")
+
+    @model_validator(mode="after")
+    def _look_goes_with_a_model(self) -> Self:
+        if "look" in self.model_fields_set and self.look != "model" and self.surface != "model":
+            refuse("look", self.look, f"goes with surface model, and the surface is {self.surface}")
+        return self
 
     @field_validator("force_range")
     @classmethod

@@ -37,7 +37,7 @@ def shared_normals(part: Part) -> np.ndarray:
     first, second = first[joined], second[joined]
     one = np.concatenate([first, following[first]])
     other = np.concatenate([following[second], second])
-    return _components(len(place), one, other)
+    return components(len(place), one, other)
 
 
 def _following(part: Part) -> np.ndarray:
@@ -48,7 +48,7 @@ def _following(part: Part) -> np.ndarray:
     return following
 
 
-def _components(count: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
+def components(count: int, one: np.ndarray, other: np.ndarray) -> np.ndarray:
     """Number the parts of a graph of nodes and edges (one, other), int32 [count]."""
     label = np.arange(count)
     while True:

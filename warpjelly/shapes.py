@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from warpjelly.kernels.lattices import STRUCTURAL
+
 from .embedding import containing_cells, embed, face_cells
 from .lattice import Lattice
 from .polygons import area_vectors, unit
@@ -24,6 +26,8 @@ SURFACE, SPRINGS, PARTICLES = "surface", "springs", "particles"
 _SHRINK, _SWELL, _SMOOTHINGS = 0.5, -0.53, 20
 # Thickness of springs and of particles that are drawn, in typical lengths of the body's springs.
 _SPRING_WIDTH, _PARTICLE_WIDTH = 0.06, 0.25
+# Thickness of the edges of faces, in edges.
+_EDGE_WIDTH = 0.05
 
 
 def _none() -> np.ndarray:
@@ -103,6 +107,14 @@ def shapes_of(body: str, lattice: Lattice, output: Output, model: LoadedModel | 
     return shapes
 
 
+def face_edges(body: str, lattice: Lattice) -> Shape:
+    """Return the edges of the faces of cells on the surface, as the structural springs that they are."""
+    quads = lattice.surface_particles[lattice.surface_quads]
+    edges = np.unique(np.sort(np.stack([quads, np.roll(quads, -1, axis=1)], axis=2).reshape(-1, 2), axis=1), axis=0)
+    kinds = np.full(len(edges), STRUCTURAL)
+    return Shape(body, SPRINGS, *_alone(edges.ravel()), width=_EDGE_WIDTH * lattice.unit, kinds=kinds)
+
+
 def at_rest(shape: Shape, lattice: Lattice) -> ShapeFrame:
     """Return the sample of a shape in the frame of its body at rest, with no velocities and forces."""
     points = np.einsum("pk,pkc->pc", shape.weights.astype(float), lattice.particles[shape.particles])
@@ -127,8 +139,8 @@ def _surface(body: str, lattice: Lattice, surface: str, model: LoadedModel | Non
         hung = _alone(lattice.surface_particles)
         return Shape(body, SURFACE, *hung, *_as_polygons(lattice.surface_quads), double_sided=True)
     if model is not None:
+        hung = embed(lattice, model.drawing.vertices, containing_cells(lattice, model.drawing.vertices))
         part = model.drawing
-        hung = embed(lattice, part.vertices, containing_cells(lattice, part.vertices))
         polygons = part.counts.astype(np.int32), part.corners.astype(np.int32)
         return Shape(body, SURFACE, *hung, *polygons, corner_normals=shared_normals(part), model=model)
     if surface == "smooth":

@@ -84,9 +84,10 @@ class StageDrawing:
             return surface if (matrix == np.eye(4)).all() else surface.transform(matrix, inplace=False)
 
         for mesh in shapes_in(self._stage, UsdGeom.Mesh):
+            alone = len(mesh.GetFaceVertexCountsAttr().Get(frame)) == 1
             for solid in self._mesh_solids(mesh, frame):
                 surface = placed(mesh, solid.surface)
-                if surface.n_cells == 1:
+                if alone:
                     drawn.floors.append(surface)
                 else:
                     drawn.solids.append(replace(solid, surface=surface))
