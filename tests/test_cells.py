@@ -86,7 +86,7 @@ def test_some_runs_are_kept(dense: np.ndarray, data: st.DataObject) -> None:
 
 @pytest.mark.parametrize("at_once", [1, 20, 1 << 25])
 def test_grid_files_are_numpy_files(tmp_path, monkeypatch, at_once: int) -> None:
-    """Write what NumPy reads and read what NumPy writes, in any order and type of numbers, few planes at a time."""
+    """Write what NumPy reads and read what NumPy writes, in any order and type of numbers, few rows at a time."""
     monkeypatch.setattr(cells_module, "_CHUNK", at_once)
     monkeypatch.setattr(gridfile, "_CHUNK", at_once)
     rng = np.random.default_rng(0)

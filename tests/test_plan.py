@@ -55,6 +55,16 @@ def make_pair(folder: Path, kind: str) -> list[dict[str, Any]]:
     small, solid = make_model(box, 4), make_model(box, 96)
     if kind == "packages":
         return [small | {"bodies": [{"type": "cube", "material": "jelly", "particles_per_edge": 5}]}, small]
+    if kind == "rows":
+        scenes = []
+        for size in (1, 5000):
+            # Two cells at opposite corners of a grid of one layer.
+            cells = np.zeros((size, size, 1), bool)
+            cells[0, 0] = cells[-1, -1] = True
+            np.savez_compressed(folder / f"corners{size}.npz", cells=cells)
+            body = {"type": "voxels", "file": str(folder / f"corners{size}.npz"), "material": "jelly"}
+            scenes.append(make_model(box, 4) | {"bodies": [body]})
+        return scenes
     if kind == "triangles":
         trimesh.creation.icosphere(subdivisions=7).export(sphere)
         return [small, make_model(sphere, 4)]
@@ -69,7 +79,7 @@ def make_pair(folder: Path, kind: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="needs Linux to measure memory")
-@pytest.mark.parametrize("kind", ["packages", "particles", "spans", "points", "triangles"])
+@pytest.mark.parametrize("kind", ["packages", "particles", "rows", "spans", "points", "triangles"])
 def test_memory_is_estimated(tmp_path: Path, kind: str) -> None:
     """Plan what memory a scene takes, and how much more another one does, within 15 %.
 

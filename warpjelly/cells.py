@@ -146,15 +146,14 @@ class Cells:
         x, y = np.divmod(gap, ny + 1)
         return Cells((nz, nx, ny), np.sort((z * nx + x) * (ny + 1) + y))
 
-    def slabs(self) -> Iterator[np.ndarray]:
-        """Yield whether each cell is occupied, a few planes of equal x at a time, bool [some, ny, nz]."""
+    def rows(self) -> Iterator[np.ndarray]:
+        """Yield whether each cell is occupied, some rows along z at a time, bool [some, nz]."""
         nx, ny, nz = self.shape
-        plane = ny * (nz + 1)
-        thickness = max(1, _CHUNK // plane)
-        for start in range(0, nx, thickness):
-            stop = min(start + thickness, nx)
-            first, last = np.searchsorted(self.edges, (start * plane, stop * plane))
-            yield Cells((stop - start, ny, nz), self.edges[first:last] - start * plane).dense()
+        width = max(1, _CHUNK // nz)
+        for start in range(0, nx * ny, width):
+            stop = min(start + width, nx * ny)
+            first, last = np.searchsorted(self.edges, (start * (nz + 1), stop * (nz + 1)))
+            yield Cells((1, stop - start, nz), self.edges[first:last] - start * (nz + 1)).dense()[0]
 
 
 def add_up(events: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -2,11 +2,12 @@
 
 Cells are true or false, or numbers by which regions of other materials choose some, 0 where there is none.
 
-Cells are written and read a few planes at a time, so a file is never larger in memory than what its cells take as runs.
+Cells are written and read some rows at a time, so in memory a file takes what its cells do as runs.
 """
 
 from __future__ import annotations
 
+import itertools
 import math
 import zipfile
 from pathlib import Path
@@ -42,8 +43,8 @@ def write_grid(path: Path, cells: Cells, origin: np.ndarray, cell_size: float) -
             with archive.open("cells.npy", "w", force_zip64=True) as file:
                 header = {"descr": "|b1", "fortran_order": False, "shape": cells.shape}
                 npy.write_array_header_1_0(file, header)
-                for planes in cells.slabs():
-                    file.write(planes.tobytes())
+                for rows in cells.rows():
+                    file.write(rows.tobytes())
             for name, value in (("origin", origin), ("cell_size", cell_size)):
                 with archive.open(f"{name}.npy", "w") as file:
                     npy.write_array(file, np.asarray(value, float))
@@ -93,25 +94,26 @@ def _read_numbers(archive: zipfile.ZipFile, name: str, count: int) -> np.ndarray
 
 
 def _read_cells(archive: zipfile.ZipFile, value: int | None) -> Cells:
-    """Read the cells plane by plane: of equal x, or in Fortran's order of equal z."""
+    """Read the cells some planes at a time, of equal x or in Fortran's order of equal z, or some rows of a plane."""
     with archive.open("cells.npy") as file:
-        shape, is_fortran, dtype = _read_header(file, "cells", MAX_CELLS)
-        if len(shape) != 3 or 0 in shape:
-            raise ValueError(f"cells must be [x, y, z], not {list(shape)}")
-        nx, ny, nz = shape
-        stored = shape[::-1] if is_fortran else shape
-        plane = stored[1] * stored[2]
-        thickness = max(1, _CHUNK // (plane * dtype.itemsize))
+        whole, is_fortran, dtype = _read_header(file, "cells", MAX_CELLS)
+        if len(whole) != 3 or 0 in whole:
+            raise ValueError(f"cells must be [x, y, z], not {list(whole)}")
+        nx, ny, nz = whole
+        stored = whole[::-1] if is_fortran else whole
+        row_size = stored[2] * dtype.itemsize
+        depth, width = max(1, _CHUNK // (stored[1] * row_size)), min(max(1, _CHUNK // row_size), stored[1])
         events = []
-        for start in range(0, stored[0], thickness):
-            count = min(thickness, stored[0] - start)
-            data = np.frombuffer(_read(file, count * plane * dtype.itemsize), dtype)
+        for plane, y in itertools.product(range(0, stored[0], depth), range(0, stored[1], width)):
+            shape = min(depth, stored[0] - plane), min(width, stored[1] - y), stored[2]
+            data = np.frombuffer(_read(file, shape[0] * shape[1] * row_size), dtype)
             if np.isnan(data).any():
                 raise ValueError("cells must be numbers; some are NaN")
-            block = (data != 0 if value is None else data == value).reshape(count, *stored[1:])
+            block = (data != 0 if value is None else data == value).reshape(shape)
             row, low, high = Cells.of(block.T if is_fortran else block).runs()
-            x, z = (0, start) if is_fortran else (start, 0)
-            place = (row + x * ny) * (nz + 1) + z
+            x, along_y = np.divmod(row, shape[1])
+            first_x, first_z = (0, plane) if is_fortran else (plane, 0)
+            place = ((first_x + x) * ny + y + along_y) * (nz + 1) + first_z
             events += [2 * (place + low) + 1, 2 * (place + high)]
     return unite((nx, ny, nz), np.concatenate(events))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -49,6 +50,8 @@ BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 BYTES_AT_REST = 300e6
 BYTES_PER_PARTICLE = {"float32": 240, "float64": 280}
 BYTES_PER_SPAN = 64
+# Where the vertices of a row along z are, for all rows of the grid, also where nothing is occupied.
+BYTES_PER_ROW = 16
 # With law "young" springs near the surface differ, so there are so many spans more per face of a jelly cube.
 YOUNG_SPANS = 2
 # Bytes at the peak of building a lattice alone.
@@ -85,6 +88,8 @@ class BodyPlan:
     """About as many spans of springs as this."""
     point_estimate: int
     """About as many points are shown as this."""
+    row_count: int = 0
+    """Number of rows along z of vertices of its grid."""
     voxel_count: int = 0
     """Number of jelly cubes."""
     triangle_count: int = 0
@@ -123,6 +128,7 @@ class Plan:
         return {
             plan.body.name or "": per_particle * plan.particle_count
             + BYTES_PER_SPAN * plan.span_estimate
+            + BYTES_PER_ROW * plan.row_count
             + per_point * plan.point_estimate
             + BYTES_PER_TRIANGLE * plan.triangle_count
             for plan in self.bodies
@@ -200,7 +206,13 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         PARTICLES: particles,
     }
     shown = sum(points[name] for name in set(scene.output.show))
-    return BodyPlan(body, names, build, particles, springs, spans, shown, cells.count, triangles, model)
+    rows = _count_rows(cells, per_edge)
+    return BodyPlan(body, names, build, particles, springs, spans, shown, rows, cells.count, triangles, model)
+
+
+def _count_rows(cells: Cells, particles_per_edge: int) -> int:
+    """Return the number of rows along z of vertices of a grid."""
+    return math.prod(n * (particles_per_edge - 1) + 1 for n in cells.shape[:2])
 
 
 def _assign_materials(
@@ -369,6 +381,7 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, Lattice, dict[str, Any]]:
     grid = voxelized.grid
     particles, springs, spans, _ = count_lattice(grid.cells)
     needed = BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * particles + BYTES_PER_BUILT_SPAN * spans
+    needed += BYTES_PER_ROW * _count_rows(grid.cells, 2)
     _require_memory(needed, f"{grid.cells.count:,} voxels, {particles:,} particles and {springs:,} springs")
     lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
     return (
