@@ -177,6 +177,59 @@ def test_smooth_surfaces_of_cells_that_only_touch_stay_apart() -> None:
     assert ours.any()
 
 
+def test_smooth_surfaces_hang_on_their_own_body() -> None:
+    """Round a hollow corner of four cells, in which the cell of another body touches them."""
+    cells = np.zeros((2, 2, 2), bool)
+    for cell in [(0, 0, 0), (1, 0, 0), (0, 1, 0), (0, 0, 1), (1, 1, 1)]:
+        cells[cell] = True
+    lattice = build_lattice(Cells.of(cells), origin=np.zeros(3), cell_size=1.0, particles_per_edge=3)
+    shape = only(shapes_of("two", lattice, Output(surface="smooth")), "surface")
+    body = np.arange(len(lattice.particles))
+    for _ in body:
+        for one, other in lattice.springs()[0]:
+            body[[one, other]] = min(body[one], body[other])
+    assert len(np.unique(body)) == 2
+    points = hung(shape.particles, shape.weights, lattice.particles)
+    assert ((points > 1.0).all(axis=1) & (body[lattice.surface_particles] == 0)).any()
+    own = np.broadcast_to(body[lattice.surface_particles][:, None], shape.particles.shape)
+    np.testing.assert_array_equal(body[shape.particles], own)
+
+
+def test_smooth_surfaces_hang_on_the_nearest_of_their_cells() -> None:
+    """Compare how far points are from the cells that they hang on with all cells that have a face at them."""
+    lattice = build_lattice(Cells.of(sphere_cells(4)), origin=np.full(3, -4.0), cell_size=1.0)
+    shape = only(shapes_of("ball", lattice, Output(surface="smooth")), "surface")
+    points = hung(shape.particles, shape.weights, lattice.particles)
+
+    def away(points: np.ndarray, centers: np.ndarray) -> np.ndarray:
+        return np.linalg.norm(np.maximum(np.abs(points - centers) - 0.5, 0.0), axis=1)
+
+    least = np.full(len(points), np.inf)
+    centers = np.repeat(face_cells(lattice) - 3.5, 4, axis=0)
+    np.minimum.at(least, shape.corners, away(points[shape.corners], centers))
+    assert least.max() > 0.1
+    # Coordinates below 4, with weights in float32.
+    np.testing.assert_allclose(away(points, lattice.particles[shape.particles].mean(axis=1)), least, rtol=0, atol=1e-5)
+
+
+def test_points_have_the_means_of_velocities_and_forces(tmp_path: Path) -> None:
+    """Move every particle of a model differently: vertices have the weighted means, and forces no less than 0."""
+    write_ball(tmp_path / "ball.ply")
+    simulator = Simulator(model_scene(tmp_path / "ball.ply"), device="cpu")
+    state, rng = simulator.state, np.random.default_rng(0)
+    v, f = rng.normal(size=(2, 3, simulator.model.particle_count))
+    # Forces of one in ten particles alone, so that points outside of their cells would have negative ones.
+    f *= 1000.0 * (rng.random(f.shape[1]) < 0.1)
+    state.v.assign(v)
+    state.f.assign(f)
+    (shape,), (sample,) = simulator.model.shapes, simulator.shapes()
+    np.testing.assert_allclose(sample.velocities, hung(shape.particles, shape.weights, v.T), rtol=0, atol=1e-5)
+    forces = hung(shape.particles, shape.weights, np.linalg.norm(f, axis=0)[:, None])[:, 0]
+    assert forces.min() < -1.0
+    # Sums of eight terms of up to some thousand, each rounded to float32.
+    np.testing.assert_allclose(sample.forces, np.maximum(forces, 0.0), rtol=0, atol=8 * 5000 * 2**-24)
+
+
 @pytest.mark.parametrize("surface", ["voxels", "smooth"])
 def test_a_shape_at_rest_is_what_a_simulator_shows_at_first(surface: str) -> None:
     """Compare the sample in the body's frame with that of a simulator, for a body that is put nowhere else."""

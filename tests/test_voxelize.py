@@ -231,7 +231,10 @@ def test_open_mesh_reports_its_open_columns(device: str) -> None:
     assert voxelize(triangles, 6, device=device).open_columns == 0
     # Without one side in z every column crosses the surface once; without the sides in z none does.
     for sign in (-1, 1):
-        assert voxelize(triangles[outward != sign], 6, device=device).open_columns == 36
+        grid = voxelize(triangles[outward != sign], 6, device=device)
+        assert grid.open_columns == 36
+        # Rays come from below: what lacks its top is filled up to the end of the grid, what lacks its bottom is not.
+        np.testing.assert_array_equal(grid.cells.dense(), np.full((6, 6, 6), sign == 1))
     assert voxelize(triangles[outward == 0], 6, device=device).open_columns == 0
     # A missing triangle leaves the columns of half the side open, with or without its diagonal.
     hole = np.delete(triangles, np.flatnonzero(outward == 1)[0], axis=0)
