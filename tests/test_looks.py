@@ -12,6 +12,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 from warpjelly.errors import SceneError
 from warpjelly.looks import Look, Placing, Texture
 from warpjelly.meshes import LoadedModel, load_model
+from warpjelly.mtlfile import read_mtl
 from warpjelly.polygons import from_polygons, joined, placed
 from warpjelly.usdlooks import define_look
 from warpjelly.validate import stage_problems
@@ -157,6 +158,22 @@ def test_what_is_missing_of_materials_is_a_warning(
     assert_drawing(model)
     assert [look.inputs for look in model.looks] == [{}] * len(files)
     assert said in caplog.text
+
+
+@pytest.mark.parametrize(
+    ("statements", "inputs"),
+    [
+        ("d 0.25", {"opacity": 0.25}),
+        ("Tr 0.25", {"opacity": 0.75}),
+        ("d 0.25\nTr 0.5", {"opacity": 0.25}),
+        ("Kd 0.5", {"diffuseColor": (0.5, 0.5, 0.5)}),
+        ("Ns 30\nPr 0.125", {"roughness": 0.125}),
+    ],
+)
+def test_mtl_values_are_inputs(tmp_path: Path, statements: str, inputs: dict[str, object]) -> None:
+    """Read opacities either way round, greys, and one of two statements for the same."""
+    (tmp_path / "a.mtl").write_text(f"newmtl paint\n{statements}\n")
+    assert read_mtl(tmp_path / "a.obj", tmp_path / "a.mtl") == [Look("paint", inputs)]
 
 
 @pytest.mark.parametrize(("name", "said"), [("a" * 300, "File name too long"), ("a\0b", "embedded null byte")])
@@ -387,7 +404,7 @@ def test_gltf_keeps_what_it_is_drawn_with(tmp_path: Path, name: str, caplog: pyt
 def test_gltf_arrays_are_read_as_they_are_stored(tmp_path: Path) -> None:
     """Read strips, fans, no indices, lines, steps between values, shares of 65535, and values that replace others."""
     arrays = {
-        "points": np.c_[POINTS[[0, 1, 3, 2]], UVS[[0, 1, 3, 2]]].astype("<f4"),
+        "points": np.c_[UVS[[0, 1, 3, 2]], POINTS[[0, 1, 3, 2]]].astype("<f4"),
         "uvs": (np.c_[UVS[[0, 1, 3, 2], 0], 1 - UVS[[0, 1, 3, 2], 1]] * 65535).astype("<u2"),
         "around": np.array([0, 1, 3, 2], "<u2"),
         "rows": np.array([2], "<u1"),
@@ -395,7 +412,7 @@ def test_gltf_arrays_are_read_as_they_are_stored(tmp_path: Path) -> None:
     }
     both = {"POSITION": "points", "TEXCOORD_0": "uvs"}
     header, data = gltf(
-        {name: array if name != "points" else array[:, :3].copy() for name, array in arrays.items()},
+        {name: array if name != "points" else array[:, 2:].copy() for name, array in arrays.items()},
         [
             {"attributes": both, "mode": 5},
             {"attributes": both, "indices": "around", "mode": 6},
@@ -403,11 +420,11 @@ def test_gltf_arrays_are_read_as_they_are_stored(tmp_path: Path) -> None:
             {"attributes": both},
         ],
     )
-    # Points lie where they did, with the UVs as what is between them.
+    # Points lie where they did, behind the UVs of each.
     start = len(data)
     data += arrays["points"].tobytes()
     header["bufferViews"].append({"buffer": 0, "byteOffset": start, "byteLength": 80, "byteStride": 20})
-    header["accessors"][0]["bufferView"] = len(header["bufferViews"]) - 1
+    header["accessors"][0] |= {"bufferView": len(header["bufferViews"]) - 1, "byteOffset": 8}
     header["accessors"][0]["sparse"] = {
         "count": 1,
         "indices": {"bufferView": 3, "componentType": GLTF_TYPES["u1"]},
@@ -557,6 +574,18 @@ def test_looks_are_written_and_read_back(
     assert len(model.region("painted")) == 1
     assert not caplog.records
     assert capfd.readouterr() == ("", "")
+
+
+def test_color_spaces_are_those_of_inputs_unless_given(tmp_path: Path) -> None:
+    """Take images for colours as sRGB, and others as they are."""
+    file = write_looks(tmp_path)
+    text = file.read_text().replace('sourceColorSpace = "sRGB"', 'sourceColorSpace = "auto"')
+    file.write_text(text.replace('sourceColorSpace = "raw"', 'sourceColorSpace = "auto"'))
+    (look,) = [look for look in load_model(file).looks if look.name == "painted"]
+    textures = {name: value for name, value in look.inputs.items() if isinstance(value, Texture)}
+    colors = {"diffuseColor", "emissiveColor", "specularColor"}
+    assert {name for name, texture in textures.items() if texture.srgb} == colors & textures.keys()
+    assert len({texture.srgb for texture in textures.values()}) == 2
 
 
 def test_images_are_written_once_under_safe_names(tmp_path: Path) -> None:
@@ -766,6 +795,17 @@ def test_dae_keeps_what_it_is_drawn_with(tmp_path: Path) -> None:
     assert paint == Look("paint", {"diffuseColor": sky, "emissiveColor": (0, 0.5, 1), "roughness": 0.5})
     assert clear.name == "m2"
     assert (clear.inputs["diffuseColor"], clear.inputs["opacity"]) == ((1, 0.5, 0.25), 0.25)
+
+
+def test_dae_opacity_is_that_of_its_mode(tmp_path: Path) -> None:
+    """Read an opacity that is what the mean of a colour leaves over."""
+    color = "<transparent><color>1 1 1 0.5</color>"
+    assert color in DAE
+    text = DAE.replace(color, '<transparent opaque="RGB_ZERO"><color>0.5 0.25 0 1</color>')
+    (tmp_path / "a.dae").write_text(text)
+    (look,) = [look for look in load_model(tmp_path / "a.dae").looks if look.name == "m2"]
+    # A transparency of 0.5 times the mean, 0.25.
+    assert look.inputs["opacity"] == 0.875
 
 
 def test_parts_of_a_3mf_have_names(tmp_path: Path) -> None:

@@ -532,6 +532,23 @@ def test_polygons_are_cut_into_triangles_inside(count: int, seed: int) -> None:
     assert areas.sum() == pytest.approx(area, rel=1e-12)
 
 
+@pytest.mark.parametrize(
+    "outline",
+    [
+        [(0, 0), (2, 0), (2, 2), (1, 1), (0, 3)],
+        [(0, 0), (1, 0), (2, 0), (2, 1), (1, 1), (1, 2), (0, 2), (0, 1)],
+    ],
+    ids=["a corner on a diagonal", "corners on edges"],
+)
+def test_no_triangle_is_flat_where_corners_are_in_line(outline: list[tuple[int, int]]) -> None:
+    """Cut polygons, from every corner on, where three corners in a line would make a triangle without a size."""
+    for first in range(len(outline)):
+        points = np.array([(x, y, 0.0) for x, y in outline[first:] + outline[:first]])
+        triangles, _ = triangulate(points, np.array([len(points)]), np.arange(len(points)))
+        a, b, c = np.moveaxis(points[triangles], 1, 0)
+        assert np.cross(b - a, c - a)[:, 2].min() > 0
+
+
 def model_scene(tmp_path: Path, **keys: object) -> wj.Scene:
     """Return a scene with one model."""
     body = {"type": "model", "material": "m", "resolution": 8, **keys}

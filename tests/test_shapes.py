@@ -422,6 +422,15 @@ def test_creases_stay_hard_and_the_rest_smooth() -> None:
     np.testing.assert_array_equal(shared_normals(loose), smooth)
 
 
+@pytest.mark.parametrize(("sides", "is_round"), [(10, True), (8, False)])
+def test_a_crease_is_where_faces_turn_by_more_than_forty_degrees(sides: int, is_round: bool) -> None:
+    """Share normals round a prism whose sides turn by 36 degrees, not where they turn by 45, nor with its ends."""
+    prism = trimesh.creation.cylinder(1.0, 2.0, sections=sides)
+    numbers = shared_normals(from_polygons(prism.vertices, np.full(len(prism.faces), 3), prism.faces.ravel()))
+    # Both ends are flat: they have a normal at each vertex. So does what is round; else each side has its own four.
+    assert len(np.unique(numbers)) == len(prism.vertices) + (2 if is_round else 4) * sides
+
+
 def test_a_models_own_normals_say_what_is_smooth() -> None:
     """Share a normal where the file has the same one for a vertex."""
     outward = (BOX[np.ravel(BOX_QUADS)] - 0.5) / np.sqrt(0.75)
