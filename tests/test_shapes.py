@@ -286,6 +286,19 @@ def test_an_embedded_model_at_rest_is_the_original(tmp_path: Path, precision: st
     np.testing.assert_allclose(sample.points, mesh.vertices, rtol=0, atol=1e-6)
 
 
+@pytest.mark.parametrize(("keys", "factor"), [({"scale": 0.25}, 0.25), ({"fit": 3.0}, 3.0)])
+def test_a_model_is_drawn_as_large_as_its_lattice(tmp_path: Path, keys: dict[str, float], factor: float) -> None:
+    """Scale a model of 1 m: every vertex is where it was, times the factor."""
+    mesh = write_ball(tmp_path / "ball.ply")
+    body = {"type": "model", "material": "jelly", "file": str(tmp_path / "ball.ply"), "resolution": 5, **keys}
+    plan = plan_scene(make_scene(bodies=[body], output={"surface": "model"})).bodies[0]
+    lattice = plan.build()
+    (shape,) = shapes_of("ball", lattice, Output(surface="model"), plan.model)
+    assert np.ptp(lattice.particles, axis=0).max() == pytest.approx(factor, rel=1e-6)
+    # Up to 12 m away in float32, from a file in float32 that makes the ball 1 m large but for its rounding.
+    np.testing.assert_allclose(at_rest(shape, lattice).points, mesh.vertices * factor, rtol=0, atol=3e-6)
+
+
 def write_painted_box(folder: Path) -> Path:
     """Write a box of quads with UVs, half of it textured, half of one colour, and the rest without a material."""
     Image.new("RGB", (4, 4), (255, 0, 0)).save(folder / "red.png")
@@ -388,7 +401,7 @@ def test_textures_are_shown_the_right_way_up(tmp_path: Path) -> None:
     simulate(model_scene(model), output=tmp_path / "run", device="cpu")
     render_preview(tmp_path / "run", tmp_path / "p.png", frames=[0], size=(320, 240))
     with Image.open(tmp_path / "p.png") as picture:
-        red, green, blue = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), 2, 0)
+        red, _, blue = np.moveaxis(np.asarray(picture.convert("RGB")).astype(int), 2, 0)
     reds, blues = np.argwhere((red > 90) & (blue < red / 3)), np.argwhere((blue > 90) & (red < blue / 3))
     assert len(reds) > 100 and len(blues) > 100
     assert reds[:, 0].mean() < blues[:, 0].mean()
