@@ -31,7 +31,7 @@ def refuse_to_replace_run(folder: Path) -> None:
     if RECORD_NAME in found and not read_record(folder)["interrupted"]:
         what, more = "a run", ""
     else:
-        what, more = "a run that did not finish", "go on with it with --resume, "
+        what, more = "a run that did not finish", "go on with --resume, "
     raise InputError(
         f"{folder}: holds {what} already ({', '.join(found)}); {more}replace it with --force, or choose another folder "
         "with -o"
