@@ -124,8 +124,7 @@ class StageDrawing:
                 if normals is not None and len(normals) == len(points):
                     surface.point_data.active_normals = np.array(normals)
                 _color(surface, colors_at(mesh, frame, len(points)))
-                by_point = mesh.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.vertex
-                yield Solid(surface, shows_force=by_point)
+                yield Solid(surface, shows_force=bool(mesh.GetDisplayColorPrimvar().GetTimeSamples()))
                 return
         # VTK has normals and texture coordinates for points alone, so every corner becomes one.
         own = np.full(len(counts), len(subsets))

@@ -251,7 +251,7 @@ class StageWriter:
 
 
 def write_still(path: Path, *, scene: Scene, shapes: Sequence[Shape], rest: Sequence[ShapeFrame]) -> None:
-    """Write shapes that do not move as a stage of one frame.
+    """Write shapes that do not move as a stage of one frame, in the colours of no force.
 
     Args:
         path: the file to make, .usdc.
@@ -263,17 +263,13 @@ def write_still(path: Path, *, scene: Scene, shapes: Sequence[Shape], rest: Sequ
         EnvironmentFailedError: the file cannot be written.
     """
     _require_writable(path.parent)
-    layer, histogram = Sdf.Layer.CreateAnonymous(".usdc"), ForceHistogram()
+    layer = Sdf.Layer.CreateAnonymous(".usdc")
     stage = Usd.Stage.Open(layer)
     define_rest(stage, scene=scene, shapes=shapes, rest=rest, provenance={}, texture_folder=path.parent / TEXTURES_NAME)
-    for sample in rest:
-        histogram.add(sample.forces)
-    force_range = histogram.color_range()
     for shape, sample in zip(shapes, rest, strict=True):
         author_sample(layer, 0, shape, sample)
-        author_colors(layer, 0, shape, sample.forces, force_range)
     bounds = _bounds_of(rest)
-    _define_motion(stage, scene, shapes, bounds, bounds.mean(axis=0), 1, force_range)
+    _define_motion(stage, scene, shapes, bounds, bounds.mean(axis=0), 1, (0.0, 1.0))
     export_layer(layer, path)
 
 

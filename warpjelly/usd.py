@@ -88,8 +88,10 @@ def define_rest(
 def legend(shapes: Iterable[Shape], force_range: tuple[float, float]) -> dict[str, object]:
     """Return what colours mean, as custom data of ``/World``; forces in N."""
     meaning = {"quantity": "force", "unit": "N", "range": Gf.Vec2d(*force_range), "colorMap": COLOR_MAP}
-    if any(shape.kinds is not None for shape in shapes):
-        meaning["springs"] = {name: Gf.Vec3d(*KIND_COLORS[kind].tolist()) for name, kind in _KIND_NAMES.items()}
+    shown = {kind for shape in shapes if shape.kinds is not None for kind in np.unique(shape.kinds).tolist()}
+    if shown:
+        named = {name: kind for name, kind in _KIND_NAMES.items() if kind in shown}
+        meaning["springs"] = {name: Gf.Vec3d(*KIND_COLORS[kind].tolist()) for name, kind in named.items()}
     return meaning
 
 
