@@ -448,6 +448,10 @@ def test_voxelize_makes_a_stage_of_the_voxels(warpjelly, tmp_path):
     quads = points[np.array(mesh.GetFaceVertexIndicesAttr().Get()).reshape(-1, 4)]
     np.testing.assert_allclose(np.linalg.norm(quads[:, 1] - quads[:, 0], axis=1), 1 / 12, rtol=1e-5)
     assert len(quads) / 144 == pytest.approx(load_mesh(TREE).area, rel=1e-4)
+    # Nothing was simulated: there are no forces to show, and the edges of the voxels have a colour of their own.
+    assert not mesh.GetDisplayColorPrimvar().GetTimeSamples()
+    edges = UsdGeom.BasisCurves(opened.GetPrimAtPath("/World/bodies/model/springs"))
+    assert len(np.unique(edges.GetDisplayColorPrimvar().ComputeFlattened(), axis=0)) == 1
 
 
 def test_voxelize_looks_below_a_prim(warpjelly, tmp_path):

@@ -18,7 +18,7 @@ from warpjelly.usdlooks import define_look
 from warpjelly.validate import stage_problems
 
 # Images are kept as they are, so it does not matter what is in them.
-RED, BLUE = b"red image", b"another, blue image"
+RED, BLUE = b"\x89PNG red", b"\xff\xd8\xff another, blue image"
 
 # A square and a triangle that share an edge, at which their UVs differ. Numbers are exact in float32.
 POINTS = np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [2, 0.5, 0.5]], float)
@@ -137,6 +137,10 @@ def test_names_are_said_to_be_missing(tmp_path: Path) -> None:
     ("files", "said"),
     [
         ({}, "the materials of paint.mtl cannot be read: No such file or directory"),
+        (
+            {"paint.mtl": "newmtl blue\nmap_Kd words.png", "words.png": "not an image"},
+            "the texture words.png is left out: it is not an image",
+        ),
         ({"paint.mtl": "newmtl blue\nmap_Kd -bm 1 none.png"}, "the texture none.png cannot be read: No such file"),
         ({"paint.mtl": "newmtl blue\nmap_Kd"}, "paint.mtl: the texture . cannot be read: Is a directory"),
         ({"paint.mtl": f"newmtl blue\nmap_Kd {'a' * 300}.png"}, "cannot be read: File name too long"),
@@ -156,7 +160,7 @@ def test_what_is_missing_of_materials_is_a_warning(
         (tmp_path / name).write_text(text)
     model = load_model(tmp_path / "a.obj")
     assert_drawing(model)
-    assert [look.inputs for look in model.looks] == [{}] * len(files)
+    assert [look.inputs for look in model.looks] == [{}] * ("paint.mtl" in files)
     assert said in caplog.text
 
 

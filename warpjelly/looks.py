@@ -69,6 +69,14 @@ def shininess_roughness(exponent: float) -> float:
     return (2.0 / (max(exponent, 0.0) + 2.0)) ** 0.25
 
 
+# How images begin: PNG, JPEG, WebP, TIFF, BMP, GIF, EXR, HDR, DDS, KTX2; and extensions of those without such a sign.
+_SIGNATURES = (
+    *(b"\x89PNG", b"\xff\xd8\xff", b"RIFF", b"II*\0", b"MM\0*", b"BM", b"GIF8", b"\x76\x2f\x31\x01"),
+    *(b"#?RADIANCE", b"DDS ", b"\xabKTX"),
+)
+_UNSIGNED = (".tga", ".pic", ".psd")
+
+
 class Images:
     """The image files that a model names, each of which is read once."""
 
@@ -77,7 +85,7 @@ class Images:
         self._read: dict[str, tuple[str, bytes] | None] = {}
 
     def read(self, name: str) -> tuple[str, bytes] | None:
-        """Return the name of a file without its folder and what is in it; None, after a warning, if it has no content.
+        """Return the name of a file without its folder and what is in it; None, after a warning, if that is no image.
 
         It is looked for beside the model, too, where its path belongs to another machine.
         """
@@ -88,7 +96,11 @@ class Images:
     def _found(self, path: Path) -> tuple[str, bytes] | None:
         folder = self._model.parent
         try:
-            return path.name, (folder / path if os.path.exists(folder / path) else folder / path.name).read_bytes()
+            data = (folder / path if os.path.exists(folder / path) else folder / path.name).read_bytes()
+            if not (data.startswith(_SIGNATURES) or path.suffix.lower() in _UNSIGNED):
+                log.warning("%s: the texture %s is left out: it is not an image of a known format", self._model, path)
+                return None
+            return path.name, data
         # A name that no file can have is a ValueError.
         except (OSError, ValueError) as error:
             why = getattr(error, "strerror", None) or error
