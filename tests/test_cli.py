@@ -606,6 +606,22 @@ def test_a_body_that_ends_inside_out_is_warned_of(warpjelly, tmp_path):
         assert ("'cube_0': inside out at the end" in err) == mirrored
 
 
+def test_a_body_that_ends_deep_in_a_collider_is_warned_of(warpjelly, tmp_path):
+    """Warn of a cube that is too heavy for the floor it lies in, with its depth, and not of a light one."""
+    # At rest each of the 9 particles below carries three of the weight, m g: k depth = 3 m g.
+    lines = ["duration = 1.0", "[materials.jelly]", 'law = "hooke"', "particle_mass = {mass}"]
+    lines += [f"{kind} = {{{{stiffness = 1e5, damping = 100.0}}}}" for kind in ("structural", "shear", "bend")]
+    lines += ["[solver]", "dt = 2e-4", "[contact]", "damping = 40.0", "[[bodies]]", 'name = "block"', 'type = "cube"']
+    lines += ["particles_per_edge = 3", "size = 0.2", 'material = "jelly"', "position = [0.0, 0.1, 0.0]"]
+    lines += ["[[colliders]]", 'type = "half_space"', "normal = [0.0, 1.0, 0.0]"]
+    scene = tmp_path / "scene.toml"
+    for mass, deep in ((10.0, True), (1.0, False)):
+        scene.write_text("\n".join(lines).format(mass=mass))
+        code, _, err = warpjelly("run", scene, "-o", tmp_path / f"out_{deep}")
+        assert code == 0
+        assert ("'block' is 0.1" in err and "deep in a collider at the end, 1." in err) == deep
+
+
 def test_bodies_that_start_in_each_other_are_warned_of(warpjelly, tmp_path):
     """Warn of bodies nearer than a unit cell, with the overlap of their balls, and not of those a cell apart."""
     cube = ["[[bodies]]", 'type = "cube"', 'material = "jelly"', "particles_per_edge = 3"]

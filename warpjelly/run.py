@@ -52,6 +52,8 @@ FRAMES_IN_FLIGHT = 2
 # evaluating the forces of so many springs once each, a second or less.
 LIMIT_SHARE = 0.02
 LIMIT_SPRINGS = 100_000_000
+# A run warns of a body that is deeper than this in a collider at the end, in unit cells.
+DEEP_END = 1.0
 # How long a forecast measures, s.
 FORECAST_SECONDS = 0.3
 
@@ -187,6 +189,7 @@ def _simulate_into(
             kept = f"{writer.saved_count} of {scene.frame_count} frames are kept; go on with --resume"
             raise EnvironmentFailedError(f"{error}; {kept}") from error
     _warn_of_inside_out(rest, sim)
+    _warn_of_deep_ends(sim)
     frames = writer.frame_count
     observer.diverged = isinstance(ended, DivergedError)
     outcomes = observer.outcomes()
@@ -386,6 +389,17 @@ def _warn_of_inside_out(rest: Sequence[ShapeFrame], sim: Simulator) -> None:
             "%s: inside out at the end; stiffer springs, a slower impact or a smaller step keep a body from it",
             ", ".join(f"'{name}'" for name in names),
         )
+
+
+def _warn_of_deep_ends(sim: Simulator) -> None:
+    depths = sim.diagnostics()["penetrations"]
+    for body, depth in zip(sim.model.bodies, depths, strict=True):
+        if depth > DEEP_END * body.unit:
+            log.warning(
+                "'%s' is %.3g m deep in a collider at the end, %.1f of its unit cells: the collider is too soft for "
+                "it; raise contact.stiffness, or that of the collider",
+                *(body.name, depth, depth / body.unit),
+            )
 
 
 def _is_mirrored(rest: np.ndarray, now: np.ndarray) -> bool:
