@@ -188,8 +188,9 @@ def _simulate_into(
                 raise
             kept = f"{writer.saved_count} of {scene.frame_count} frames are kept; go on with --resume"
             raise EnvironmentFailedError(f"{error}; {kept}") from error
-    _warn_of_inside_out(rest, sim)
-    _warn_of_deep_ends(sim)
+    if not isinstance(ended, DivergedError):
+        _warn_of_inside_out(rest, sim)
+        _warn_of_deep_ends(sim)
     frames = writer.frame_count
     observer.diverged = isinstance(ended, DivergedError)
     outcomes = observer.outcomes()

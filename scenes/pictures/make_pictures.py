@@ -13,7 +13,7 @@ import warpjelly as wj
 from warpjelly.preview import render_preview
 
 HERE = Path(__file__).parent
-SIZE, MOVIE_SIZE = (420, 340), (800, 450)
+SIZE, MOVIE_SIZE = (420, 236), (800, 450)
 GAP = 4
 # The frames that tell a scene's story.
 FRAMES = {
