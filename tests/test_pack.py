@@ -22,7 +22,8 @@ from warpjelly.scenefile import load_scene
 from warpjelly.stagefiles import open_stage, progress
 from warpjelly.validate import stage_problems
 
-IMAGES = {"red paint.png": b"not looked into", "blue.png": b"nor is this"}
+# Of images, only the first bytes are looked at.
+IMAGES = {"red paint.png": b"\x89PNG red", "blue.png": b"\x89PNG blue"}
 SUFFIXES = [".usdc", ".usda", ".usdz"]
 
 
