@@ -11,6 +11,7 @@ whole grid in scan order: so springs come in order, and in runs as long as they 
 
 import warp as wp
 
+from . import runs
 from .springs import MAX_SPAN
 
 wp.set_module_options({"enable_backward": False})
@@ -78,22 +79,20 @@ class Bends:
 
 
 @wp.func
+def row_of(grid: Grid, run: int):
+    """Return x and y of the row of vertices that a run is in."""
+    row = grid.run_row[run]
+    return row / grid.shape[1], row % grid.shape[1]
+
+
+@wp.func
 def vertex(grid: Grid, x: int, y: int, z: int):
     """Return the place of a vertex, NONE where no cell touches it."""
     place = int(NONE)
     if x >= 0 and y >= 0 and x < grid.shape[0] and y < grid.shape[1]:
-        # The first run that ends above z.
         row = x * grid.shape[1] + y
-        run = grid.row_start[row]
-        last = grid.row_start[row + 1]
-        end = last
-        while run < last:
-            middle = (run + last) / 2
-            if grid.run_high[middle] > z:
-                last = middle
-            else:
-                run = middle + 1
-        if run < end and z >= grid.run_low[run]:
+        run = runs.first_beyond(grid.row_start, grid.run_high, row, z)
+        if run < grid.row_start[row + 1] and z >= grid.run_low[run]:
             place = grid.run_start[run] + z - grid.run_low[run]
     return place
 
@@ -210,8 +209,7 @@ def find_alike(
 ):
     """Overwrite ``alike`` of a run of vertices, where there are several materials."""
     run = wp.tid()
-    x = grid.run_row[run] / grid.shape[1]
-    y = grid.run_row[run] % grid.shape[1]
+    x, y = row_of(grid, run)
     start = grid.run_start[run] - grid.run_low[run]
     for z in range(grid.run_low[run], grid.run_high[run]):
         pattern = int(grid.patterns[start + z])
@@ -230,8 +228,7 @@ def place_particles(
 ):
     """Overwrite the grid coordinates of the particles of a run, and add the cells of each material that share each."""
     run = wp.tid()
-    x = grid.run_row[run] / grid.shape[1]
-    y = grid.run_row[run] % grid.shape[1]
+    x, y = row_of(grid, run)
     start = grid.run_start[run] - grid.run_low[run]
     for z in range(grid.run_low[run], grid.run_high[run]):
         pattern = int(grid.patterns[start + z])
@@ -360,8 +357,7 @@ def find_spans(
     last = vec8i()
     span = wp.vec4i(0, 0, 0, 0)
     for run in range(grid.run_row.shape[0]):
-        x = grid.run_row[run] / grid.shape[1]
-        y = grid.run_row[run] % grid.shape[1]
+        x, y = row_of(grid, run)
         for z in range(grid.run_low[run], grid.run_high[run]):
             here = grid.run_start[run] + z - grid.run_low[run]
             there = vertex(grid, x + reach * dx, y + reach * dy, z + reach * dz)
@@ -429,8 +425,7 @@ def find_faces(
     step = wp.vec3i(0, 0, 0)
     step[axis] = 2 * side - 1
     for run in range(grid.run_row.shape[0]):
-        x = grid.run_row[run] / grid.shape[1]
-        y = grid.run_row[run] % grid.shape[1]
+        x, y = row_of(grid, run)
         for z in range(grid.run_low[run], grid.run_high[run]):
             if occupied(grid, x, y, z):
                 if not occupied(grid, x + step[0], y + step[1], z + step[2]):

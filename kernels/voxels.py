@@ -14,6 +14,8 @@ neighbouring triangles never both count a column, nor both miss it. All tests ar
 
 import warp as wp
 
+from .runs import first_beyond
+
 wp.set_module_options({"enable_backward": False})
 
 # Vertices are snapped to this fraction of a cell. At 4096 cells an edge function stays within 2 (2^12 2^18)^2 = 2^61.
@@ -218,18 +220,9 @@ def _is_near(runs: Runs, i: int, j: int, k: int):
         x = i + (n + 4) % 9 / 3 - 1
         y = j + (n + 4) % 3 - 1
         if not near and x >= 0 and y >= 0 and x < runs.shape[0] and y < runs.shape[1]:
-            # The first run that ends beyond k - 1.
             row = x * runs.shape[1] + y
-            first = runs.row_start[row]
-            last = runs.row_start[row + 1]
-            end = last
-            while first < last:
-                middle = (first + last) / 2
-                if runs.high[middle] > k - 1:
-                    last = middle
-                else:
-                    first = middle + 1
-            near = first < end and runs.low[first] <= k + 1
+            first = first_beyond(runs.row_start, runs.high, row, k - 1)
+            near = first < runs.row_start[row + 1] and runs.low[first] <= k + 1
     return near
 
 

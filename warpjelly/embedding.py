@@ -8,6 +8,7 @@ import warp as wp
 from warpjelly.kernels import embedding
 
 from .lattice import Lattice
+from .polygons import area_vectors
 
 
 def containing_cells(lattice: Lattice, points: np.ndarray) -> np.ndarray:
@@ -44,10 +45,10 @@ def containing_cells(lattice: Lattice, points: np.ndarray) -> np.ndarray:
 
 def face_cells(lattice: Lattice) -> np.ndarray:
     """Return the unit cell behind each face of the surface, int32 [face_count, 3]."""
-    corners = lattice.grid_coordinates(lattice.particles[lattice.surface_particles])[lattice.surface_quads]
-    outward = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1]) / 2
-    # Half a cell behind the middle of the face is the centre of the cell.
-    return np.floor(corners.mean(axis=1) - outward / 2).astype(np.int32)
+    points, quads = lattice.grid_coordinates(lattice.particles[lattice.surface_particles]), lattice.surface_quads
+    # Half a cell behind the middle of the face is the centre of the cell; area vectors here are two cells long.
+    outward = area_vectors(points, np.full(len(quads), 4), quads.ravel())
+    return np.floor(points[quads].mean(axis=1) - outward / 4).astype(np.int32)
 
 
 def embed(lattice: Lattice, points: np.ndarray, cells: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -30,7 +30,7 @@ from .scene import (
     Scene,
     SphereCollider,
 )
-from .shapes import Shape, shapes_of
+from .shapes import Shape, shapes_of, starts_of
 
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
@@ -390,13 +390,12 @@ def _shape_table(shapes: Sequence[Shape], first_particles: Sequence[int], device
     """Return the table of shapes for the kernels, given the first particle of each one's body."""
 
     def joined(parts: Iterable[np.ndarray], dtype: Any) -> wp.array:
-        return wp.array(np.concatenate([np.zeros(0), *parts]), dtype=dtype, device=device)
+        return wp.array(np.concatenate(list(parts)), dtype=dtype, device=device)
 
     def starts(lengths: Iterable[np.ndarray]) -> wp.array:
         return wp.array(np.cumsum(np.concatenate([[0], *lengths])), dtype=wp.int32, device=device)
 
-    first_points = np.cumsum([0, *(len(shape.particles) for shape in shapes)])
-    first_normals = np.cumsum([0, *(shape.normal_count for shape in shapes)])
+    first_points, first_normals = starts_of(shapes)
     table = Shapes()
     table.point_start = starts(np.full(len(shape.particles), shape.particles.shape[1]) for shape in shapes)
     table.particles = joined(

@@ -26,7 +26,7 @@ from .colors import SRGB_TABLE, srgb_from_linear
 from .errors import InputError
 from .looks import Texture
 from .polygons import triangulate
-from .solids import colors_at, diffuse, room_floor, shapes_in, texture_pixels, the_camera
+from .solids import colors_at, diffuse, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
 
 # More than that, no browser holds.
 MAX_BYTES = 1_000_000_000
@@ -108,16 +108,15 @@ def review_page(
 
 
 def _surfaces(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
+    images: dict[str, bytes] = {}
     for mesh in shapes_in(stage, UsdGeom.Mesh):
         points, counts = mesh.GetPointsAttr(), np.array(mesh.GetFaceVertexCountsAttr().Get(frame))
         corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
         chosen, corners, smooth = _split_at_edges(mesh, corners, frame)
         triangles, faces = triangulate(np.array(points.Get(frame)).reshape(-1, 3)[chosen], counts, corners)
         subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
-        own = np.full(len(counts), len(subsets))
-        for number, subset in enumerate(subsets):
-            own[np.array(subset.GetIndicesAttr().Get(), int)] = number
-        colors = [*(_plain_color(subset.GetPrim()) for subset in subsets), None]
+        own = subset_of_faces(subsets, len(counts))
+        colors = [*(_plain_color(subset.GetPrim(), images) for subset in subsets), None]
         order = np.argsort(own[faces], kind="stable")
         numbers, sizes = np.unique(own[faces], return_counts=True)
         parts = [
@@ -186,9 +185,9 @@ def _balls(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
         yield _Shape(balls.GetPrim(), "balls", balls.GetPointsAttr().Get, np.empty((0, 3)), [], width=width)
 
 
-def _plain_color(prim: Usd.Prim) -> list[float] | None:
+def _plain_color(prim: Usd.Prim, images: dict[str, bytes]) -> list[float] | None:
     """Return the one colour of a prim's material, sRGB: that of a texture is its mean; None without a look."""
-    value = diffuse(prim)
+    value = diffuse(prim, images)
     if value is None:
         return None
     if isinstance(value, Texture):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
@@ -107,6 +108,12 @@ def shapes_of(body: str, lattice: Lattice, output: Output, model: LoadedModel | 
     return shapes
 
 
+def starts_of(shapes: Sequence[Shape]) -> tuple[np.ndarray, np.ndarray]:
+    """Return where points and normals of shapes start, one shape after another, and the ends: int [shape_count + 1]."""
+    points = np.cumsum([0, *(len(shape.particles) for shape in shapes)])
+    return points, np.cumsum([0, *(shape.normal_count for shape in shapes)])
+
+
 def face_edges(body: str, lattice: Lattice) -> Shape:
     """Return the edges of the faces of cells on the surface, as the structural springs that they are."""
     quads = lattice.surface_particles[lattice.surface_quads]
@@ -139,8 +146,8 @@ def _surface(body: str, lattice: Lattice, surface: str, model: LoadedModel | Non
         hung = _alone(lattice.surface_particles)
         return Shape(body, SURFACE, *hung, *_as_polygons(lattice.surface_quads), double_sided=True)
     if model is not None:
-        hung = embed(lattice, model.drawing.vertices, containing_cells(lattice, model.drawing.vertices))
         part = model.drawing
+        hung = embed(lattice, part.vertices, containing_cells(lattice, part.vertices))
         polygons = part.counts.astype(np.int32), part.corners.astype(np.int32)
         return Shape(body, SURFACE, *hung, *polygons, corner_normals=shared_normals(part), model=model)
     if surface == "smooth":
@@ -164,8 +171,7 @@ def _split_by_direction(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
         [face_count, 4].
     """
     quads = lattice.surface_quads
-    corners = lattice.particles[lattice.surface_particles][quads]
-    outward = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    outward = area_vectors(lattice.particles[lattice.surface_particles], *_as_polygons(quads))
     axis = np.abs(outward).argmax(axis=1)
     direction = 2 * axis + (np.take_along_axis(outward, axis[:, None], axis=1)[:, 0] > 0)
     points, split, count = [], np.empty_like(quads), 0

@@ -18,7 +18,7 @@ from .errors import DivergedError, SceneError
 from .model import Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
-from .shapes import ShapeFrame
+from .shapes import ShapeFrame, starts_of
 from .softcontact import SoftContact
 from .stability import (
     BOUNCE_SHARE,
@@ -68,9 +68,7 @@ class Simulator:
         self.dt = self.scene.dt_for(self.substeps)
         """The time step used, s."""
         chunk_count = len(self.model.chunk_body)
-        # Where the points and the normals of each shape start.
-        self._point_start = np.cumsum([0, *(len(shape.particles) for shape in self.model.shapes)])
-        self._normal_start = np.cumsum([0, *(shape.normal_count for shape in self.model.shapes)])
+        self._point_start, self._normal_start = starts_of(self.model.shapes)
         point_count = int(self._point_start[-1])
         with wp.ScopedDevice(self.device):
             # What only Runge-Kutta schemes need between their stages.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from io import BytesIO
 from pathlib import Path
@@ -73,6 +73,7 @@ class StageDrawing:
     def __init__(self, pyvista: Any, stage: Usd.Stage) -> None:
         self._pyvista, self._stage = pyvista, stage
         self._looks: dict[Sdf.Path, tuple[Any, pv.Texture | None]] = {}
+        self._images: dict[str, bytes] = {}
 
     def at(self, frame: int) -> Drawn:
         """Return what is to be seen at a frame; the shapes are as many, and in the same order, at each."""
@@ -127,9 +128,7 @@ class StageDrawing:
                 yield Solid(surface, shows_force=bool(mesh.GetDisplayColorPrimvar().GetTimeSamples()))
                 return
         # VTK has normals and texture coordinates for points alone, so every corner becomes one.
-        own = np.full(len(counts), len(subsets))
-        for number, subset in enumerate(subsets):
-            own[np.array(subset.GetIndicesAttr().Get(), int)] = number
+        own = subset_of_faces(subsets, len(counts))
         colors, uvs = colors_at(mesh, frame, len(points)), _by_corner(mesh, "st", frame)
         normals = _by_corner(mesh, "normals", frame)
         for number in np.unique(own).tolist():
@@ -151,7 +150,7 @@ class StageDrawing:
         """Return the diffuse colour of a prim, and its image if it is a texture."""
         path = prim.GetPath()
         if path not in self._looks:
-            value = diffuse(prim)
+            value = diffuse(prim, self._images)
             self._looks[path] = value, _image(self._pyvista, value) if isinstance(value, Texture) else None
         return self._looks[path]
 
@@ -198,10 +197,23 @@ def _by_corner(mesh: UsdGeom.Mesh, name: str, frame: int) -> np.ndarray | None:
     return np.array(primvar.ComputeFlattened(frame))
 
 
-def diffuse(prim: Usd.Prim) -> Any:
-    """Return the diffuse colour of a prim's material: linear, or a texture; None where it has no look of its own."""
+def subset_of_faces(subsets: Sequence[UsdGeom.Subset], face_count: int) -> np.ndarray:
+    """Return which subset each face is in, int [face_count]; where it is in none, the number of subsets."""
+    own = np.full(face_count, len(subsets))
+    for number, subset in enumerate(subsets):
+        own[np.array(subset.GetIndicesAttr().Get(), int)] = number
+    return own
+
+
+def diffuse(prim: Usd.Prim, images: dict[str, bytes]) -> Any:
+    """Return the diffuse colour of a prim's material: linear, or a texture; None where it has no look of its own.
+
+    Args:
+        prim: what has the material.
+        images: what was read of images so far, by path; what is read now is added.
+    """
     material = UsdShade.MaterialBindingAPI(prim).ComputeBoundMaterial()[0]
-    look = read_look(Path(prim.GetStage().GetRootLayer().realPath), material, {}) if material else None
+    look = read_look(Path(prim.GetStage().GetRootLayer().realPath), material, images) if material else None
     # What a UsdPreviewSurface is unless told otherwise.
     return None if look is None else look.inputs.get("diffuseColor", (0.18, 0.18, 0.18))
 
