@@ -19,7 +19,7 @@ from warpjelly.run import simulate
 from warpjelly.scene import Scene
 from warpjelly.shapes import SURFACE, Shape, ShapeFrame
 from warpjelly.simulator import Simulator
-from warpjelly.stagewriter import StageWriter
+from warpjelly.stage.stagewriter import StageWriter
 
 SUBSTEPS = 100
 FRAMES_SIMULATED = 25

@@ -46,5 +46,5 @@ def _has_browser() -> bool:
 
 def _has_egl() -> bool:
     # In a process of its own: where it does not work, VTK may crash instead of failing.
-    script = "from warpjelly.view import require_pyvista; require_pyvista()"
+    script = "from warpjelly.previews.view import require_pyvista; require_pyvista()"
     return subprocess.run([sys.executable, "-c", script], check=False, capture_output=True).returncode == 0

@@ -12,7 +12,7 @@ from pxr import Usd
 
 from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
-from warpjelly.stagefiles import open_stage
+from warpjelly.stage.stagefiles import open_stage
 
 CUBE = Path(__file__).parents[1] / "scenes" / "jello_cube.toml"
 SETTINGS: dict[str, Any] = {"bodies.cube.particles_per_edge": 4, "duration": 2.0}

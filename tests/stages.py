@@ -12,8 +12,8 @@ import numpy as np
 
 from warpjelly.scene import Scene
 from warpjelly.shapes import SURFACE, Shape, ShapeFrame
-from warpjelly.stagefiles import STAGE_NAME
-from warpjelly.stagewriter import StageWriter
+from warpjelly.stage.stagefiles import STAGE_NAME
+from warpjelly.stage.stagewriter import StageWriter
 
 
 @dataclass(frozen=True)

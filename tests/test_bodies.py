@@ -22,8 +22,8 @@ from warpjelly.plan import plan_scene
 from warpjelly.run import simulate
 from warpjelly.scene import Material
 from warpjelly.simulator import Simulator
-from warpjelly.stagefiles import open_stage
-from warpjelly.validate import stage_problems
+from warpjelly.stage.stagefiles import open_stage
+from warpjelly.stage.validate import stage_problems
 
 YOUNG = {"law": "young", "youngs_modulus": 2e4, "density": 500.0}
 # One body of each kind but models, around the origin, with a material of its own.
@@ -343,7 +343,7 @@ def test_a_preview_shows_springs_in_their_colors(tmp_path: Path) -> None:
     body = {**BODIES["network"], "name": "net", "points": [*BODIES["network"]["points"], [0.5, 0.5, 0.5]]}
     simulate(make_scene(bodies=[body], materials=MATERIALS), output=tmp_path, device="cpu")
     script = (
-        "import sys; from pathlib import Path; from warpjelly.preview import render_preview\n"
+        "import sys; from pathlib import Path; from warpjelly.previews.preview import render_preview\n"
         "render_preview(Path(sys.argv[1]), Path(sys.argv[2]), size=(320, 180))"
     )
     command = [sys.executable, "-c", script, str(tmp_path), str(tmp_path / "p.png")]

@@ -20,8 +20,8 @@ import warpjelly as wj
 from warpjelly import cli, plan
 from warpjelly.meshes import EXTENSIONS, EXTRA_EXTENSIONS, load_mesh
 from warpjelly.scene import Scene
-from warpjelly.stagefiles import open_stage
-from warpjelly.validate import stage_problems
+from warpjelly.stage.stagefiles import open_stage
+from warpjelly.stage.validate import stage_problems
 
 SCENES = Path(__file__).parent.parent / "scenes"
 CUBE = str(SCENES / "jello_cube.toml")

@@ -12,10 +12,10 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdUtils
 from warpjelly.errors import SceneError
 from warpjelly.looks import Look, Placing, Texture
 from warpjelly.meshes import LoadedModel, load_model
-from warpjelly.mtlfile import read_mtl
 from warpjelly.polygons import from_polygons, joined, placed
-from warpjelly.usdlooks import define_look
-from warpjelly.validate import stage_problems
+from warpjelly.readers.mtlfile import read_mtl
+from warpjelly.stage.usdlooks import define_look
+from warpjelly.stage.validate import stage_problems
 
 # Images are kept as they are, so it does not matter what is in them.
 RED, BLUE = b"\x89PNG red", b"\xff\xd8\xff another, blue image"

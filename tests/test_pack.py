@@ -16,11 +16,11 @@ from stages import cube_surface, make_scene, moved_surface, start_stage, write_s
 
 from warpjelly import cli
 from warpjelly.errors import EnvironmentFailedError, InputError
-from warpjelly.pack import pack
 from warpjelly.run import simulate
 from warpjelly.scenefile import load_scene
-from warpjelly.stagefiles import open_stage, progress
-from warpjelly.validate import stage_problems
+from warpjelly.stage.pack import pack
+from warpjelly.stage.stagefiles import open_stage, progress
+from warpjelly.stage.validate import stage_problems
 
 # Of images, only the first bytes are looked at.
 IMAGES = {"red paint.png": b"\x89PNG red", "blue.png": b"\x89PNG blue"}

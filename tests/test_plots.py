@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from warpjelly.errors import EnvironmentFailedError, InputError
-from warpjelly.plots import plot_metrics, read_metrics
+from warpjelly.previews.plots import plot_metrics, read_metrics
 
 COLUMNS = (
     "frame time kinetic elastic potential contact spring_losses field_work contact_losses friction_losses "

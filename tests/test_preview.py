@@ -14,9 +14,9 @@ from pxr import Usd, UsdGeom
 from stages import cube_surface, make_scene, moved_surface, start_stage, write_stage
 
 from warpjelly.errors import EnvironmentFailedError, InputError
-from warpjelly.preview import render_preview
-from warpjelly.stagefiles import open_stage
-from warpjelly.view import View
+from warpjelly.previews.preview import render_preview
+from warpjelly.previews.view import View
+from warpjelly.stage.stagefiles import open_stage
 
 SIZE = (320, 180)
 
@@ -218,7 +218,7 @@ def test_all_colliders_are_drawn(tmp_path: Path) -> None:
     ]
     path = write_stage(tmp_path / "stage.usdc", make_scene(colliders=colliders), frames=0)
     script = (
-        "import sys; from pathlib import Path; from warpjelly.preview import render_preview\n"
+        "import sys; from pathlib import Path; from warpjelly.previews.preview import render_preview\n"
         "render_preview(Path(sys.argv[1]), Path(sys.argv[2]), size=(160, 90))"
     )
     command = [sys.executable, "-c", script, str(path), str(tmp_path / "p.png")]
@@ -241,7 +241,7 @@ def test_missing_egl_is_explained(tmp_path: Path) -> None:
     pytest.importorskip("pyvista")
     path = write_stage(tmp_path / "stage.usdc", frames=1)
     script = (
-        "import sys; from pathlib import Path; from warpjelly.preview import render_preview\n"
+        "import sys; from pathlib import Path; from warpjelly.previews.preview import render_preview\n"
         "from warpjelly.errors import EnvironmentFailedError\n"
         "try:\n"
         "    render_preview(Path(sys.argv[1]), Path(sys.argv[2]), size=(160, 90))\n"

@@ -21,8 +21,8 @@ from warpjelly.background import Background
 from warpjelly.checkpoint import Checkpoint, load_checkpoint
 from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.run import RunEndedError, simulate
-from warpjelly.stagefiles import open_stage, progress
-from warpjelly.validate import stage_problems
+from warpjelly.stage.stagefiles import open_stage, progress
+from warpjelly.stage.validate import stage_problems
 
 KILLS = int(os.environ.get("WARPJELLY_KILLS", "5"))
 FINISHED = ["checkpoint.npz", "metrics.csv", "run.json", "stage.usdc"]

@@ -19,9 +19,9 @@ from stages import cube_surface, make_scene, write_stage
 from warpjelly.colors import SRGB_TABLE, srgb_from_linear
 from warpjelly.errors import InputError
 from warpjelly.looks import Look, Texture
-from warpjelly.preview import render_preview
-from warpjelly.stagefiles import open_stage
-from warpjelly.usdlooks import define_look
+from warpjelly.previews.preview import render_preview
+from warpjelly.stage.stagefiles import open_stage
+from warpjelly.stage.usdlooks import define_look
 
 
 def contents(page: Path) -> tuple[dict[str, Any], bytes]:
@@ -138,7 +138,7 @@ def test_few_edges_split_points_and_many_are_shaded_flat(tmp_path: Path, sharp: 
 
 def test_too_much_for_a_page_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Say how much it is, and what thins it."""
-    monkeypatch.setattr("warpjelly.review.MAX_BYTES", 1000)
+    monkeypatch.setattr("warpjelly.previews.review.MAX_BYTES", 1000)
     with pytest.raises(InputError, match=r"102 points in 10 frames .* --every"):
         render_preview(write_stage(tmp_path / "stage.usdc"), tmp_path / "r.html")
     assert not (tmp_path / "r.html").exists()

@@ -21,14 +21,14 @@ from warpjelly.embedding import containing_cells, embed, face_cells
 from warpjelly.lattice import Lattice, build_lattice
 from warpjelly.plan import plan_scene
 from warpjelly.polygons import Part, from_polygons
-from warpjelly.preview import render_preview
+from warpjelly.previews.preview import render_preview
 from warpjelly.run import simulate
 from warpjelly.scene import Output
 from warpjelly.shading import shared_normals
 from warpjelly.shapes import Shape, at_rest, face_edges, shapes_of
 from warpjelly.simulator import Simulator
-from warpjelly.stagefiles import open_stage
-from warpjelly.validate import stage_problems
+from warpjelly.stage.stagefiles import open_stage
+from warpjelly.stage.validate import stage_problems
 
 ORIGIN, CELL = np.array([-1.0, 0.5, 2.0]), 0.25
 
@@ -415,7 +415,7 @@ def test_springs_over_a_floor_are_drawn_in_bounded_memory(tmp_path: Path) -> Non
     scene = make_scene(bodies=[body], colliders=[floor], output={"show": ["springs"]}, frames=1)
     simulate(scene, output=tmp_path / "run", device="cpu")
     script = (
-        "import resource, sys; from pathlib import Path; from warpjelly.preview import render_preview\n"
+        "import resource, sys; from pathlib import Path; from warpjelly.previews.preview import render_preview\n"
         "render_preview(Path(sys.argv[1]), Path(sys.argv[2]), size=(320, 180))\n"
         "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss)"
     )

@@ -13,10 +13,10 @@ from stages import cube_surface, make_scene, moved_surface, start_stage, write_s
 
 from warpjelly.colors import COLOR_COUNT, LINEAR_TABLE, SRGB_TABLE, color_indices, linear_from_srgb, srgb_from_linear
 from warpjelly.errors import EnvironmentFailedError, InputError
-from warpjelly.histogram import ForceHistogram
 from warpjelly.shapes import ShapeFrame
-from warpjelly.stagefiles import open_stage, progress
-from warpjelly.validate import stage_problems
+from warpjelly.stage.histogram import ForceHistogram
+from warpjelly.stage.stagefiles import open_stage, progress
+from warpjelly.stage.validate import stage_problems
 
 FLOORS = {
     "Y": [{"name": "floor", "type": "half_space", "normal": [0.0, 1.0, 0.0]}],

@@ -10,7 +10,7 @@ from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 from stages import cube_surface, make_scene, write_stage
 
 from warpjelly.errors import InputError
-from warpjelly.validate import stage_problems
+from warpjelly.stage.validate import stage_problems
 
 SURFACE = "/World/bodies/cube/surface"
 

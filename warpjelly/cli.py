@@ -241,7 +241,7 @@ def voxelize(
         write_grid(output, grid.cells, grid.origin, grid.cell_size)
     elif output is not None:
         from .shapes import at_rest, face_edges, shapes_of
-        from .stagewriter import write_still
+        from .stage.stagewriter import write_still
 
         shapes = [*shapes_of("model", lattice, scene.output), face_edges("model", lattice)]
         write_still(output, scene=scene, shapes=shapes, rest=[at_rest(shape, lattice) for shape in shapes])
@@ -270,8 +270,8 @@ def validate(
 
     The stage of a run that was killed or interrupted is as sound as any, but said not to be finished.
     """
-    from .stagefiles import open_stage, progress
-    from .validate import stage_problems
+    from .stage.stagefiles import open_stage, progress
+    from .stage.validate import stage_problems
 
     problems = stage_problems(stage)
     for problem in problems:
@@ -296,7 +296,7 @@ def pack(
     Textures go into a .usdz, and into a folder beside a .usdc or .usda.
     """
     from .files import refuse_to_replace
-    from .pack import pack as pack_stage
+    from .stage.pack import pack as pack_stage
 
     refuse_to_replace(output, force=force)
     pack_stage(source, output)
@@ -344,11 +344,11 @@ def preview(
     if plots:
         if frames or every != 1:
             raise InputError("--plots shows all frames: leave out --frame and --every")
-        from .plots import plot_metrics
+        from .previews.plots import plot_metrics
 
         plot_metrics(source, output, size=pixels, force=force)
     else:
-        from .preview import render_preview
+        from .previews.preview import render_preview
 
         with _progress("rendering") as show:
             render_preview(source, output, frames=frames or None, every=every, size=pixels, force=force, progress=show)

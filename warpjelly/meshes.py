@@ -14,10 +14,10 @@ import numpy as np
 import trimesh
 
 from .errors import SceneError, listed
-from .gltffile import read_gltf
 from .looks import Look
-from .polygonfiles import read_obj, read_off, read_ply
 from .polygons import Model, Part, from_polygons, joined, placed, triangulate
+from .readers.gltffile import read_gltf
+from .readers.polygonfiles import read_obj, read_off, read_ply
 from .scene import USD_EXTENSIONS
 
 # What can be read with nothing else installed, and what each other format needs besides.
@@ -131,11 +131,11 @@ def load_model(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> Lo
 def _read(path: Path, kind: str, prim: str | None) -> Model:
     # These take long to import, and COLLADA's reader may not be installed.
     if kind in USD_EXTENSIONS:
-        from .usdmodel import read_usd
+        from .readers.usdmodel import read_usd
 
         return read_usd(path, prim)
     if kind == ".dae":
-        from .daefile import read_dae
+        from .readers.daefile import read_dae
 
         return read_dae(path)
     return _READERS.get(kind, _read_triangles)(path)

@@ -40,8 +40,8 @@ from .scene import Scene
 from .shapes import SURFACE, ShapeFrame
 from .simulator import Simulator
 from .stability import evaluations
-from .stagefiles import find_stage
-from .stagewriter import StageWriter
+from .stage.stagefiles import find_stage
+from .stage.stagewriter import StageWriter
 from .starts import warn_of_deep_starts
 
 log = logging.getLogger("warpjelly")

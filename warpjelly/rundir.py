@@ -16,8 +16,8 @@ from .errors import EnvironmentFailedError, InputError
 from .files import unfinished_name, whole_file
 from .scene import Scene
 from .shapes import ShapeFrame
-from .stagefiles import CLIPS_NAME, ROOT_NAME, STAGE_NAME, STAGE_NAMES, TEXTURES_NAME
-from .stagewriter import StageWriter
+from .stage.stagefiles import CLIPS_NAME, ROOT_NAME, STAGE_NAME, STAGE_NAMES, TEXTURES_NAME
+from .stage.stagewriter import StageWriter
 
 RECORD_NAME, METRICS_NAME, CHECKPOINT_NAME = "run.json", "metrics.csv", "checkpoint.npz"
 

@@ -10,7 +10,7 @@ from pathlib import Path
 from PIL import Image
 
 import warpjelly as wj
-from warpjelly.preview import render_preview
+from warpjelly.previews.preview import render_preview
 
 HERE = Path(__file__).parent
 SIZE, MOVIE_SIZE = (420, 236), (800, 450)

@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd
 
-from .errors import EnvironmentFailedError, InputError
-from .files import whole_file
+from ..errors import EnvironmentFailedError, InputError
+from ..files import whole_file
+from ..plan import clip_length
+from ..scene import Scene
+from ..shapes import Shape, ShapeFrame
 from .histogram import ForceHistogram
 from .pack import has_forces, join_clips, recolor_clip
-from .plan import clip_length
 from .prims import WORLD
-from .scene import Scene
-from .shapes import Shape, ShapeFrame
 from .stagefiles import (
     CLIPS_NAME,
     GEOMETRY_NAME,

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, UsdShade
 
-from .colors import srgb_from_linear
-from .errors import InputError
-from .looks import Texture
-from .usdlooks import read_look
+from ..colors import srgb_from_linear
+from ..errors import InputError
+from ..looks import Texture
+from ..stage.usdlooks import read_look
 
 if TYPE_CHECKING:
     import pyvista as pv

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .errors import EnvironmentFailedError, InputError
-from .files import refuse_to_replace, whole_file
-from .rundir import METRICS_NAME
+from ..errors import EnvironmentFailedError, InputError
+from ..files import refuse_to_replace, whole_file
+from ..rundir import METRICS_NAME
 
 MAX_SIZE = 8192
 

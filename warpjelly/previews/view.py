@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from pxr import Usd
 
-from .errors import EnvironmentFailedError, InputError
+from ..errors import EnvironmentFailedError, InputError
 from .floors import BACKGROUND, Floor
 from .solids import Drawn, Solid, StageDrawing, room_floor, the_camera
 

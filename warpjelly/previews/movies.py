@@ -10,7 +10,7 @@ from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
-from .errors import EnvironmentFailedError, InputError
+from ..errors import EnvironmentFailedError, InputError
 
 # H.264 as browsers play it, from the first bytes of the file on; the quality is 0 to 51, lower is better. WebP that
 # repeats for ever; the quality goes up to 100, higher is better.

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
-from .looks import Look
+from ..looks import Look
+from ..polygons import Model, from_polygons
 from .mtlfile import read_mtl
-from .polygons import Model, from_polygons
 
 log = logging.getLogger("warpjelly")
 

@@ -16,7 +16,9 @@ from pxr import Gf, Kind, Sdf, Tf, Usd, UsdGeom, UsdLux, UsdShade, Vt
 
 from warpjelly.kernels.lattices import BEND, FACE_SHEAR, STRUCTURAL
 
-from .colors import COLOR_MAP, KIND_COLORS, LINEAR_TABLE, color_indices
+from ..colors import COLOR_MAP, KIND_COLORS, LINEAR_TABLE, color_indices
+from ..scene import Scene
+from ..shapes import SPRINGS, SURFACE, Shape, ShapeFrame
 from .prims import (
     BODIES,
     COLLIDER_GREY,
@@ -32,12 +34,10 @@ from .prims import (
     matrix,
     vectors,
 )
-from .scene import Scene
-from .shapes import SPRINGS, SURFACE, Shape, ShapeFrame
 from .usdlooks import define_look
 
 if TYPE_CHECKING:
-    from .meshes import LoadedModel
+    from ..meshes import LoadedModel
 
 FORCE = "primvars:force"
 COLOR = "primvars:displayColor"

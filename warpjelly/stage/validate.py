@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
 
-from .errors import reason
+from ..errors import reason
 from .stagefiles import open_stage
 
 # The newest crate version that common viewers open.

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from pxr import Sdf, Tf, Usd
 
-from .errors import EnvironmentFailedError, InputError, reason
-from .files import whole_file
+from ..errors import EnvironmentFailedError, InputError, reason
+from ..files import whole_file
 from .prims import WORLD
 
 STAGE_NAME = "stage.usdc"

@@ -11,9 +11,9 @@ import numpy as np
 from collada.material import OPAQUE_MODE, Effect, Map, Material
 from collada.scene import Node, SceneNode
 
-from .errors import SceneError
-from .looks import Images, Look, Texture, Value, shininess_roughness
-from .polygons import Model, Part, from_polygons, placed
+from ..errors import SceneError
+from ..looks import Images, Look, Texture, Value, shininess_roughness
+from ..polygons import Model, Part, from_polygons, placed
 
 
 def read_dae(path: Path) -> Model:

@@ -22,10 +22,10 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom, UsdShade
 
-from .colors import SRGB_TABLE, srgb_from_linear
-from .errors import InputError
-from .looks import Texture
-from .polygons import triangulate
+from ..colors import SRGB_TABLE, srgb_from_linear
+from ..errors import InputError
+from ..looks import Texture
+from ..polygons import triangulate
 from .solids import colors_at, diffuse, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
 
 # More than that, no browser holds.
@@ -101,7 +101,7 @@ def review_page(
         "STAGE": json.dumps(description).replace("</", "<\\/"),
         "ARRAYS": base64.b64encode(zlib.compress(b"".join(arrays), 9)).decode(),
     }
-    page = resources.files("warpjelly").joinpath("review.html").read_text(encoding="utf-8")
+    page = resources.files(__package__).joinpath("review.html").read_text(encoding="utf-8")
     for name, value in values.items():
         page = page.replace(f"{{{{{name}}}}}", value)
     return page

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pxr import Usd
 
-from .colors import SRGB_TABLE, srgb_from_linear
+from ..colors import SRGB_TABLE, srgb_from_linear
 
 _INK = (70, 74, 84)
 _GAP = 4

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
+from ..scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider, plane_frame
 from .prims import (
     CAMERA,
     COLLIDER_GREY,
@@ -16,7 +17,6 @@ from .prims import (
     matrix,
     vectors,
 )
-from .scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider, plane_frame
 
 # The camera has a 50 mm lens and a 36 mm wide 16:9 film back, and looks slightly down from the right. Directions are
 # for Y up.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from .scene import Scene
+from ..scene import Scene
 
 WORLD = Sdf.Path("/World")
 BODIES = WORLD.AppendChild("bodies")

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils
 
-from .errors import SceneError, listed, reason
-from .looks import Look
-from .polygons import Model, Part, from_polygons, placed
-from .usdlooks import read_look
+from ..errors import SceneError, listed, reason
+from ..looks import Look
+from ..polygons import Model, Part, from_polygons, placed
+from ..stage.usdlooks import read_look
 
 log = logging.getLogger("warpjelly")
 

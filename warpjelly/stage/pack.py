@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 from pxr import Ar, Sdf, Tf, Usd, UsdUtils
 
-from .errors import EnvironmentFailedError, InputError
-from .files import whole_file
+from ..errors import EnvironmentFailedError, InputError
+from ..files import whole_file
 from .prims import WORLD
 from .stagefiles import (
     GEOMETRY_NAME,

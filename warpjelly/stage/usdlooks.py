@@ -9,8 +9,8 @@ from typing import Any
 
 from pxr import Ar, Gf, Sdf, Usd, UsdShade
 
-from .files import whole_file
-from .looks import Look, Placing, Texture, Value
+from ..files import whole_file
+from ..looks import Look, Placing, Texture, Value
 
 log = logging.getLogger("warpjelly")
 

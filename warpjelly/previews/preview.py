@@ -9,14 +9,14 @@ from pathlib import Path
 import numpy as np
 from pxr import Usd, UsdGeom
 
+from ..errors import EnvironmentFailedError, InputError
+from ..files import refuse_to_replace, whole_file
+from ..stage.stagefiles import open_stage
+from ..stage.validate import stage_problems
 from .captions import captioned
-from .errors import EnvironmentFailedError, InputError
-from .files import refuse_to_replace, whole_file
 from .movies import MOVIES, movie_writer
 from .review import review_page
 from .solids import shapes_in
-from .stagefiles import open_stage
-from .validate import stage_problems
 from .view import View
 
 MIN_SIZE, MAX_SIZE = 16, 8192

@@ -19,8 +19,8 @@ from urllib.parse import unquote
 import numpy as np
 from trimesh.transformations import quaternion_matrix
 
-from .looks import Images, Look, Placing, Texture, Value
-from .polygons import Model, Part, from_polygons, placed
+from ..looks import Images, Look, Placing, Texture, Value
+from ..polygons import Model, Part, from_polygons, placed
 
 log = logging.getLogger("warpjelly")
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from .looks import NORMAL_BIAS, NORMAL_SCALE, Images, Look, Placing, Texture, Value, shininess_roughness
+from ..looks import NORMAL_BIAS, NORMAL_SCALE, Images, Look, Placing, Texture, Value, shininess_roughness
 
 log = logging.getLogger("warpjelly")
 
