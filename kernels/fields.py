@@ -103,17 +103,37 @@ def field_force(fields: Any, m: int, point: Any, velocity: Any, charge: Any):
     return fields.strength[m]
 
 
+@wp.func_native(f"""
+    {vectors.EACH}
+    for (int row = 0; row < 3; ++row) {{
+        auto weight = gravity.data[0][row];
+        auto m = mass.data;
+        auto p = f.data + row * f.shape[1];
+        each(begin, end, [=](int i) {{ p[i] = m[i] * weight; }});
+    }}
+""")
+def _set_weights(
+    mass: wp.array(dtype=Any), gravity: wp.array(dtype=Any), f: wp.array2d(dtype=Any), begin: int, end: int, lanes: int
+): ...
+
+
 @wp.kernel
 def set_gravity_forces(
     # Model:
     mass: wp.array(dtype=Any),
     gravity: wp.array(dtype=Any),
+    chunk_start: wp.array(dtype=wp.int32),
+    # In:
+    lanes: int,
     # State out:
     f: wp.array2d(dtype=Any),
 ):
-    """Overwrite the forces with the weight of each particle; gravity is one vector [m/s^2]."""
-    i = wp.tid()
-    vectors.store(f, i, mass[i] * gravity[0])
+    """Overwrite the forces with the weight of each particle; gravity is one vector [m/s^2].
+
+    Launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk.
+    """
+    chunk, lane = wp.tid()
+    _set_weights(mass, gravity, f, chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes)
 
 
 @wp.kernel

@@ -17,32 +17,127 @@ STAGES = {
 }
 
 
+# Both schemes go row by row: components are independent of each other.
+@wp.func_native(f"""
+    {vectors.EACH}
+    for (int row = 0; row < 3; ++row) {{
+        auto step = dt;
+        auto inverse = inv_mass.data;
+        auto force = f.data + row * f.shape[1];
+        auto start = x_start.data + row * x_start.shape[1];
+        auto place = x.data + row * x.shape[1];
+        auto speed = v.data + row * v.shape[1];
+        each(begin, end, [=](int i) {{
+            start[i] = place[i];
+            speed[i] += step * inverse[i] * force[i];
+            place[i] += step * speed[i];
+        }});
+    }}
+""")
+def _advance(
+    inv_mass: wp.array(dtype=Any),
+    f: wp.array2d(dtype=Any),
+    dt: Any,
+    x_start: wp.array2d(dtype=Any),
+    x: wp.array2d(dtype=Any),
+    v: wp.array2d(dtype=Any),
+    begin: int,
+    end: int,
+    lanes: int,
+): ...
+
+
 @wp.kernel
 def semi_implicit_euler(
     # Model:
     inv_mass: wp.array(dtype=Any),
+    chunk_start: wp.array(dtype=wp.int32),
     # State in:
     f: wp.array2d(dtype=Any),
     # In:
     dt: Any,
+    lanes: int,
     # State in and out:
     x_start: wp.array2d(dtype=Any),
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
 ):
-    """Advance by dt: first the velocities by the forces, then the positions by the new velocities."""
-    i = wp.tid()
-    position = vectors.load(x, i)
-    velocity = vectors.load(v, i) + dt * inv_mass[i] * vectors.load(f, i)
-    vectors.store(x_start, i, position)
-    vectors.store(v, i, velocity)
-    vectors.store(x, i, position + dt * velocity)
+    """Advance by dt: first the velocities by the forces, then the positions by the new velocities.
+
+    Launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk.
+    """
+    chunk, lane = wp.tid()
+    _advance(inv_mass, f, dt, x_start, x, v, chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes)
+
+
+# The lambda is compiled for each of the four cases, so that no case is looked at within a loop.
+@wp.func_native(f"""
+    {vectors.EACH}
+    struct yes {{ enum {{ value = 1 }}; }};
+    struct no {{ enum {{ value = 0 }}; }};
+    auto stage = [&](auto is_first, auto is_last) {{
+        for (int row = 0; row < 3; ++row) {{
+            auto step = dt, share = weight, ahead = reach * dt;
+            auto inverse = inv_mass.data;
+            auto force = f.data + row * f.shape[1];
+            auto place = x.data + row * x.shape[1];
+            auto speed = v.data + row * v.shape[1];
+            auto place_start = x_start.data + row * x_start.shape[1];
+            auto speed_start = v_start.data + row * v_start.shape[1];
+            auto place_sum = x_sum.data + row * x_sum.shape[1];
+            auto speed_sum = v_sum.data + row * v_sum.shape[1];
+            each(begin, end, [=](int i) {{
+                auto x_rate = speed[i], v_rate = inverse[i] * force[i];
+                auto x_total = share * x_rate, v_total = share * v_rate;
+                if (decltype(is_first)::value) {{
+                    place_start[i] = place[i];
+                    speed_start[i] = speed[i];
+                }} else {{
+                    x_total += place_sum[i];
+                    v_total += speed_sum[i];
+                }}
+                if (decltype(is_last)::value) {{
+                    place[i] = place_start[i] + step * x_total;
+                    speed[i] = speed_start[i] + step * v_total;
+                }} else {{
+                    place_sum[i] = x_total;
+                    speed_sum[i] = v_total;
+                    place[i] = place_start[i] + ahead * x_rate;
+                    speed[i] = speed_start[i] + ahead * v_rate;
+                }}
+            }});
+        }}
+    }};
+    if (first && last) stage(yes(), yes());
+    else if (first) stage(yes(), no());
+    else if (last) stage(no(), yes());
+    else stage(no(), no());
+""")
+def _advance_stage(
+    inv_mass: wp.array(dtype=Any),
+    f: wp.array2d(dtype=Any),
+    dt: Any,
+    weight: Any,
+    reach: Any,
+    first: bool,
+    last: bool,
+    x_start: wp.array2d(dtype=Any),
+    v_start: wp.array2d(dtype=Any),
+    x_sum: wp.array2d(dtype=Any),
+    v_sum: wp.array2d(dtype=Any),
+    x: wp.array2d(dtype=Any),
+    v: wp.array2d(dtype=Any),
+    begin: int,
+    end: int,
+    lanes: int,
+): ...
 
 
 @wp.kernel
 def runge_kutta_stage(
     # Model:
     inv_mass: wp.array(dtype=Any),
+    chunk_start: wp.array(dtype=wp.int32),
     # State in:
     f: wp.array2d(dtype=Any),
     # In:
@@ -51,6 +146,7 @@ def runge_kutta_stage(
     reach: Any,
     first: bool,
     last: bool,
+    lanes: int,
     # State in and out:
     x_start: wp.array2d(dtype=Any),
     v_start: wp.array2d(dtype=Any),
@@ -62,27 +158,12 @@ def runge_kutta_stage(
     """Use the forces of one stage; x and v become the next stage's trial state, or after the last one the new state.
 
     The rates (v, f / m) of the stages are summed with their weights. The next trial state lies ``reach`` dt from the
-    start along this stage's rates.
+    start along this stage's rates. Launched over (chunk, lane), as above.
     """
-    i = wp.tid()
-    x_rate = vectors.load(v, i)
-    v_rate = inv_mass[i] * vectors.load(f, i)
-    x_total = weight * x_rate
-    v_total = weight * v_rate
-    if first:
-        vectors.store(x_start, i, vectors.load(x, i))
-        vectors.store(v_start, i, vectors.load(v, i))
-    else:
-        x_total += vectors.load(x_sum, i)
-        v_total += vectors.load(v_sum, i)
-    if last:
-        vectors.store(x, i, vectors.load(x_start, i) + dt * x_total)
-        vectors.store(v, i, vectors.load(v_start, i) + dt * v_total)
-    else:
-        vectors.store(x_sum, i, x_total)
-        vectors.store(v_sum, i, v_total)
-        vectors.store(x, i, vectors.load(x_start, i) + reach * dt * x_rate)
-        vectors.store(v, i, vectors.load(v_start, i) + reach * dt * v_rate)
+    chunk, lane = wp.tid()
+    begin = chunk_start[chunk] + lane
+    end = chunk_start[chunk + 1]
+    _advance_stage(inv_mass, f, dt, weight, reach, first, last, x_start, v_start, x_sum, v_sum, x, v, begin, end, lanes)
 
 
 @wp.kernel

@@ -76,25 +76,28 @@ def add_spring_forces(
     wp.atomic_add(losses, index, wp.float64(loss_weight * damping_power(offset, velocity, c[2])))
 
 
-# The same law for a whole span on the CPU, in three passes that the compiler turns into vector instructions. It could
-# not do so in one pass, where the two ends may overlap. Within a pass no particle occurs twice, so plain adds do.
+# The same law for a whole span on the CPU, in three passes of vector instructions. One pass would not do, where the two
+# ends may overlap. Within a pass no particle occurs twice, so plain adds do.
 @wp.func_native(f"""
     auto law_rest = rest;
     typedef decltype(law_rest) real;
-    const real* __restrict px = x.data + i;
-    const real* __restrict py = px + x.shape[1];
-    const real* __restrict pz = py + x.shape[1];
-    const real* __restrict qx = x.data + j;
-    const real* __restrict qy = qx + x.shape[1];
-    const real* __restrict qz = qy + x.shape[1];
-    const real* __restrict pu = v.data + i;
-    const real* __restrict pv = pu + v.shape[1];
-    const real* __restrict pw = pv + v.shape[1];
-    const real* __restrict qu = v.data + j;
-    const real* __restrict qv = qu + v.shape[1];
-    const real* __restrict qw = qv + v.shape[1];
+    const int lanes = 1;
+    {vectors.EACH}
+    const real* px = x.data + i;
+    const real* py = px + x.shape[1];
+    const real* pz = py + x.shape[1];
+    const real* qx = x.data + j;
+    const real* qy = qx + x.shape[1];
+    const real* qz = qy + x.shape[1];
+    const real* pu = v.data + i;
+    const real* pv = pu + v.shape[1];
+    const real* pw = pv + v.shape[1];
+    const real* qu = v.data + j;
+    const real* qv = qu + v.shape[1];
+    const real* qw = qv + v.shape[1];
     real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}], power[{MAX_SPAN}];
-    for (int s = 0; s < count; ++s) {{
+    for (int k = 0; k < 8; ++k) power[((count - 1) & ~7) + k] = real(0);
+    each(0, count, [&](int s) {{
         real dx = qx[s] - px[s], dy = qy[s] - py[s], dz = qz[s] - pz[s];
         real du = qu[s] - pu[s], dv = qv[s] - pv[s], dw = qw[s] - pw[s];
         real square = dx * dx + dy * dy + dz * dz;
@@ -111,20 +114,18 @@ def add_spring_forces(
         gy[s] = scale * dy;
         gz[s] = scale * dz;
         power[s] = damping * approach * approach;
-    }}
-    real* __restrict fx = f.data + i;
-    real* __restrict fy = fx + f.shape[1];
-    real* __restrict fz = fy + f.shape[1];
-    for (int s = 0; s < count; ++s) {{ fx[s] += gx[s]; fy[s] += gy[s]; fz[s] += gz[s]; }}
+    }});
+    real* fx = f.data + i;
+    real* fy = fx + f.shape[1];
+    real* fz = fy + f.shape[1];
+    each(0, count, [&](int s) {{ fx[s] += gx[s]; fy[s] += gy[s]; fz[s] += gz[s]; }});
     fx += j - i;
     fy += j - i;
     fz += j - i;
-    for (int s = 0; s < count; ++s) {{ fx[s] -= gx[s]; fy[s] -= gy[s]; fz[s] -= gz[s]; }}
+    each(0, count, [&](int s) {{ fx[s] -= gx[s]; fy[s] -= gy[s]; fz[s] -= gz[s]; }});
     // Eight sums at once: a single one would wait for each addition in turn.
     real sums[8] = {{}};
-    int s = 0;
-    for (; s + 8 <= count; s += 8) for (int k = 0; k < 8; ++k) sums[k] += power[s + k];
-    for (int k = 0; s < count; ++s, ++k) sums[k] += power[s];
+    for (int s = 0; s < count; s += 8) for (int k = 0; k < 8; ++k) sums[k] += power[s + k];
     real total = ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]));
     losses.data[span] += double(loss_weight * total);
 """)

@@ -15,7 +15,7 @@ from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators
 
 from .device import choose_device
 from .errors import DivergedError, SceneError
-from .model import Model, State, build, launch_spring_forces
+from .model import CHUNK_SIZE, Model, State, build, launch_spring_forces
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
 from .shapes import ShapeFrame, starts_of
@@ -68,6 +68,8 @@ class Simulator:
         self.dt = self.scene.dt_for(self.substeps)
         """The time step used, s."""
         chunk_count = len(self.model.chunk_body)
+        # Lanes per chunk: where threads of a launch run one after another, one does best.
+        self._lanes = 1 if self.device == "cpu" else CHUNK_SIZE
         self._point_start, self._normal_start = starts_of(self.model.shapes)
         point_count = int(self._point_start[-1])
         with wp.ScopedDevice(self.device):
@@ -396,8 +398,8 @@ class Simulator:
         model, state = self.model, self.state
         self._launch(
             integrators.semi_implicit_euler,
-            model.particle_count,
-            [model.particle_inv_mass, state.f, model.real(dt)],
+            (len(model.chunk_body), self._lanes),
+            [model.particle_inv_mass, model.chunk_start, state.f, model.real(dt), self._lanes],
             [state.x_start, state.x, state.v],
         )
 
@@ -406,8 +408,11 @@ class Simulator:
         real = model.real
         self._launch(
             integrators.runge_kutta_stage,
-            model.particle_count,
-            [model.particle_inv_mass, state.f, real(dt), real(weight), real(reach), first, last],
+            (len(model.chunk_body), self._lanes),
+            [
+                *(model.particle_inv_mass, model.chunk_start, state.f),
+                *(real(dt), real(weight), real(reach), first, last, self._lanes),
+            ],
             [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
         )
 
@@ -424,7 +429,12 @@ class Simulator:
         model, state = self.model, self.state
         on_cpu = self.device == "cpu"
         weight = model.real(loss_weight)
-        self._launch(fields.set_gravity_forces, model.particle_count, [model.particle_mass, model.gravity], [state.f])
+        self._launch(
+            fields.set_gravity_forces,
+            (len(model.chunk_body), self._lanes),
+            [model.particle_mass, model.gravity, model.chunk_start, self._lanes],
+            [state.f],
+        )
         if self.scene.fields:
             self._launch(
                 fields.add_field_forces,
