@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from . import bounds, vectors
+from . import bounds, turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -261,8 +261,22 @@ def collider_bit(c: int):
     return wp.uint32(1) << wp.uint32(wp.min(c, 31))
 
 
+@wp.func
+def near_colliders(colliders: Any, body: int, lower: Any, upper: Any, culling: bool):
+    """Return a mask of the colliders that a box of particles may touch; of all without culling."""
+    near = wp.uint32(0)
+    for c in range(colliders.kind.shape[0]):
+        if not culling or may_touch(colliders, c, body, lower, upper):
+            near |= collider_bit(c)
+    return near
+
+
 @wp.kernel
 def add_contact_forces(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     mass: wp.array(dtype=Any),
     inv_mass: wp.array(dtype=Any),
@@ -282,74 +296,76 @@ def add_contact_forces(
     ahead: Any,
     first: bool,
     culling: bool,
-    lanes: int,
     # State in and out:
     stamps: wp.array2d(dtype=wp.int32),
     normals: wp.array2d(dtype=Any),
     f: wp.array2d(dtype=Any),
     losses: wp.array2d(dtype=wp.float64),
 ):
-    """Add the contact forces, launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk.
+    """Add the contact forces, launched over (part, lane), where parts are chunks from part_start on.
 
-    The first evaluation of a step remembers contacts; those of later stages look at trial positions only. Losses
-    [2, chunk_count] gain what contact damping and friction take, at the velocities that the forces make some time
-    ahead, times loss_weight.
+    Lane k takes particles k, k + lanes, ... of each chunk. The first evaluation of a step remembers contacts; those of
+    later stages look at trial positions only. Losses [2, chunk_count] gain what contact damping and friction take, at
+    the velocities that the forces make some time ahead, times loss_weight.
     """
-    chunk, lane = wp.tid()
-    body = chunk_body[chunk]
-    low = vectors.load(lower, chunk)
-    high = vectors.load(upper, chunk)
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
     now = step[0]
     at_start = now == wp.int64(0)
     # In the first evaluation a contact of the step before still holds; later ones go by what the first one found.
     latest = now
     if not first:
         latest = now + wp.int64(1)
-    near = wp.uint32(0)
-    for c in range(colliders.kind.shape[0]):
-        if not culling or may_touch(colliders, c, body, low, high):
-            near |= collider_bit(c)
-    if near == wp.uint32(0):
-        return
-    damped = wp.float64(0.0)
-    rubbed = wp.float64(0.0)
-    for i in range(chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes):
-        point = vectors.load(x, i)
-        start = vectors.load(x_start, i)
-        total = type(dt)(0.0) * point
-        damping = type(dt)(0.0) * point
-        rubbing = type(dt)(0.0) * point
-        touches = bool(False)
-        for c in range(colliders.kind.shape[0]):
-            if near & collider_bit(c) != wp.uint32(0):
-                held = held_contact(colliders, c, stamps, i, latest)
-                before = held_normal(colliders, c, normals, i)
-                normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, at_start)
-                if depth >= type(dt)(0.0):
-                    touches = True
-                    if first:
-                        remember_contact(colliders, c, i, now, normal, stamps, normals)
-                    velocity = vectors.load(v, i)
-                    speed = wp.dot(velocity, normal)
-                    # Without the other colliders' reactions, so that their order does not matter.
-                    applied = vectors.load(f, i)
-                    pressing = -wp.dot(applied, normal)
-                    reaction = normal_reaction(colliders, c, counted, speed, pressing)
-                    # With what others rub already, so that all together do no more than stop the particle.
-                    rubbed_along = rubbing - wp.dot(rubbing, normal) * normal
-                    along = velocity - speed * normal
-                    pull = applied + pressing * normal + rubbed_along
-                    friction = friction_force(colliders, c, reaction, pressing, along, pull, mass[i], dt)
-                    rubbing += friction
-                    total += reaction * normal + friction
-                    damping += (reaction - colliders.stiffness[c] * counted) * normal
-        # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
-        if touches:
-            force = vectors.load(f, i) + total
-            vectors.store(f, i, force)
-            # Colliders come last, so that this is the whole force.
-            velocity = vectors.load(v, i) + ahead * inv_mass[i] * force
-            damped -= wp.float64(wp.dot(damping, velocity))
-            rubbed -= wp.float64(wp.dot(rubbing, velocity))
-    wp.atomic_add(losses, 0, chunk, wp.float64(loss_weight) * damped)
-    wp.atomic_add(losses, 1, chunk, wp.float64(loss_weight) * rubbed)
+    begin = part_start[part]
+    end = part_start[part + 1]
+    if not mine:
+        end = begin
+    for chunk in range(begin, end):
+        body = chunk_body[chunk]
+        near = near_colliders(colliders, body, vectors.load(lower, chunk), vectors.load(upper, chunk), culling)
+        if near == wp.uint32(0):
+            continue
+        damped = wp.float64(0.0)
+        rubbed = wp.float64(0.0)
+        for i in range(chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes):
+            point = vectors.load(x, i)
+            start = vectors.load(x_start, i)
+            total = type(dt)(0.0) * point
+            damping = type(dt)(0.0) * point
+            rubbing = type(dt)(0.0) * point
+            touches = bool(False)
+            for c in range(colliders.kind.shape[0]):
+                if near & collider_bit(c) != wp.uint32(0):
+                    held = held_contact(colliders, c, stamps, i, latest)
+                    before = held_normal(colliders, c, normals, i)
+                    normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, at_start)
+                    if depth >= type(dt)(0.0):
+                        touches = True
+                        if first:
+                            remember_contact(colliders, c, i, now, normal, stamps, normals)
+                        velocity = vectors.load(v, i)
+                        speed = wp.dot(velocity, normal)
+                        # Without the other colliders' reactions, so that their order does not matter.
+                        applied = vectors.load(f, i)
+                        pressing = -wp.dot(applied, normal)
+                        reaction = normal_reaction(colliders, c, counted, speed, pressing)
+                        # With what others rub already, so that all together do no more than stop the particle.
+                        rubbed_along = rubbing - wp.dot(rubbing, normal) * normal
+                        along = velocity - speed * normal
+                        pull = applied + pressing * normal + rubbed_along
+                        friction = friction_force(colliders, c, reaction, pressing, along, pull, mass[i], dt)
+                        rubbing += friction
+                        total += reaction * normal + friction
+                        damping += (reaction - colliders.stiffness[c] * counted) * normal
+            # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
+            if touches:
+                force = vectors.load(f, i) + total
+                vectors.store(f, i, force)
+                # Colliders come last, so that this is the whole force.
+                velocity = vectors.load(v, i) + ahead * inv_mass[i] * force
+                damped -= wp.float64(wp.dot(damping, velocity))
+                rubbed -= wp.float64(wp.dot(rubbing, velocity))
+        wp.atomic_add(losses, 0, chunk, wp.float64(loss_weight) * damped)
+        wp.atomic_add(losses, 1, chunk, wp.float64(loss_weight) * rubbed)
+    turns.leave(turn, task, mine)

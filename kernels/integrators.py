@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from . import vectors
+from . import turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -19,14 +19,15 @@ STAGES = {
 
 # Both schemes go row by row: components are independent of each other.
 @wp.func_native(f"""
+    {vectors.ROW}
     {vectors.EACH}
-    for (int row = 0; row < 3; ++row) {{
+    for (int axis = 0; axis < 3; ++axis) {{
         auto step = dt;
         auto inverse = inv_mass.data;
-        auto force = f.data + row * f.shape[1];
-        auto start = x_start.data + row * x_start.shape[1];
-        auto place = x.data + row * x.shape[1];
-        auto speed = v.data + row * v.shape[1];
+        auto force = row(f, axis);
+        auto start = row(x_start, axis);
+        auto place = row(x, axis);
+        auto speed = row(v, axis);
         each(begin, end, [=](int i) {{
             start[i] = place[i];
             speed[i] += step * inverse[i] * force[i];
@@ -49,14 +50,16 @@ def _advance(
 
 @wp.kernel
 def semi_implicit_euler(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     inv_mass: wp.array(dtype=Any),
-    chunk_start: wp.array(dtype=wp.int32),
     # State in:
     f: wp.array2d(dtype=Any),
     # In:
     dt: Any,
-    lanes: int,
     # State in and out:
     x_start: wp.array2d(dtype=Any),
     x: wp.array2d(dtype=Any),
@@ -64,28 +67,33 @@ def semi_implicit_euler(
 ):
     """Advance by dt: first the velocities by the forces, then the positions by the new velocities.
 
-    Launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk.
+    Launched over (part, lane); lane k takes particles k, k + lanes, ... of the part.
     """
-    chunk, lane = wp.tid()
-    _advance(inv_mass, f, dt, x_start, x, v, chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes)
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
+    if mine:
+        _advance(inv_mass, f, dt, x_start, x, v, part_start[part] + lane, part_start[part + 1], lanes)
+    turns.leave(turn, task, mine)
 
 
 # The lambda is compiled for each of the four cases, so that no case is looked at within a loop.
 @wp.func_native(f"""
+    {vectors.ROW}
     {vectors.EACH}
     struct yes {{ enum {{ value = 1 }}; }};
     struct no {{ enum {{ value = 0 }}; }};
     auto stage = [&](auto is_first, auto is_last) {{
-        for (int row = 0; row < 3; ++row) {{
+        for (int axis = 0; axis < 3; ++axis) {{
             auto step = dt, share = weight, ahead = reach * dt;
             auto inverse = inv_mass.data;
-            auto force = f.data + row * f.shape[1];
-            auto place = x.data + row * x.shape[1];
-            auto speed = v.data + row * v.shape[1];
-            auto place_start = x_start.data + row * x_start.shape[1];
-            auto speed_start = v_start.data + row * v_start.shape[1];
-            auto place_sum = x_sum.data + row * x_sum.shape[1];
-            auto speed_sum = v_sum.data + row * v_sum.shape[1];
+            auto force = row(f, axis);
+            auto place = row(x, axis);
+            auto speed = row(v, axis);
+            auto place_start = row(x_start, axis);
+            auto speed_start = row(v_start, axis);
+            auto place_sum = row(x_sum, axis);
+            auto speed_sum = row(v_sum, axis);
             each(begin, end, [=](int i) {{
                 auto x_rate = speed[i], v_rate = inverse[i] * force[i];
                 auto x_total = share * x_rate, v_total = share * v_rate;
@@ -135,9 +143,12 @@ def _advance_stage(
 
 @wp.kernel
 def runge_kutta_stage(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     inv_mass: wp.array(dtype=Any),
-    chunk_start: wp.array(dtype=wp.int32),
     # State in:
     f: wp.array2d(dtype=Any),
     # In:
@@ -146,7 +157,6 @@ def runge_kutta_stage(
     reach: Any,
     first: bool,
     last: bool,
-    lanes: int,
     # State in and out:
     x_start: wp.array2d(dtype=Any),
     v_start: wp.array2d(dtype=Any),
@@ -158,18 +168,30 @@ def runge_kutta_stage(
     """Use the forces of one stage; x and v become the next stage's trial state, or after the last one the new state.
 
     The rates (v, f / m) of the stages are summed with their weights. The next trial state lies ``reach`` dt from the
-    start along this stage's rates. Launched over (chunk, lane), as above.
+    start along this stage's rates. Launched over (part, lane), as above.
     """
-    chunk, lane = wp.tid()
-    begin = chunk_start[chunk] + lane
-    end = chunk_start[chunk + 1]
-    _advance_stage(inv_mass, f, dt, weight, reach, first, last, x_start, v_start, x_sum, v_sum, x, v, begin, end, lanes)
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
+    if mine:
+        begin = part_start[part] + lane
+        end = part_start[part + 1]
+        _advance_stage(
+            inv_mass, f, dt, weight, reach, first, last, x_start, v_start, x_sum, v_sum, x, v, begin, end, lanes
+        )
+    turns.leave(turn, task, mine)
 
 
 @wp.kernel
 def count_step(
+    # Threads:
+    turn: turns.Turn,
     # State in and out:
     step: wp.array(dtype=wp.int64),
 ):
-    """Count a finished step in step[0]; a launch of one thread, since captured launches freeze their scalars."""
-    step[wp.tid()] += wp.int64(1)
+    """Count a finished step in step[0]; a launch of one task, since captured launches freeze their scalars."""
+    task = wp.tid()
+    mine = turns.take(turn, task)
+    if mine:
+        step[task] += wp.int64(1)
+    turns.leave(turn, task, mine)

@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import vectors
+from . import turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -82,19 +82,12 @@ def add_spring_forces(
     auto law_rest = rest;
     typedef decltype(law_rest) real;
     const int lanes = 1;
+    {vectors.ROW}
     {vectors.EACH}
-    const real* px = x.data + i;
-    const real* py = px + x.shape[1];
-    const real* pz = py + x.shape[1];
-    const real* qx = x.data + j;
-    const real* qy = qx + x.shape[1];
-    const real* qz = qy + x.shape[1];
-    const real* pu = v.data + i;
-    const real* pv = pu + v.shape[1];
-    const real* pw = pv + v.shape[1];
-    const real* qu = v.data + j;
-    const real* qv = qu + v.shape[1];
-    const real* qw = qv + v.shape[1];
+    const real *px = row(x, 0) + i, *py = row(x, 1) + i, *pz = row(x, 2) + i;
+    const real *qx = row(x, 0) + j, *qy = row(x, 1) + j, *qz = row(x, 2) + j;
+    const real *pu = row(v, 0) + i, *pv = row(v, 1) + i, *pw = row(v, 2) + i;
+    const real *qu = row(v, 0) + j, *qv = row(v, 1) + j, *qw = row(v, 2) + j;
     real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}], power[{MAX_SPAN}];
     for (int k = 0; k < 8; ++k) power[((count - 1) & ~7) + k] = real(0);
     each(0, count, [&](int s) {{
@@ -115,9 +108,7 @@ def add_spring_forces(
         gz[s] = scale * dz;
         power[s] = damping * approach * approach;
     }});
-    real* fx = f.data + i;
-    real* fy = fx + f.shape[1];
-    real* fz = fy + f.shape[1];
+    real *fx = row(f, 0) + i, *fy = row(f, 1) + i, *fz = row(f, 2) + i;
     each(0, count, [&](int s) {{ fx[s] += gx[s]; fy[s] += gy[s]; fz[s] += gz[s]; }});
     fx += j - i;
     fy += j - i;
@@ -147,6 +138,9 @@ def _add_span(
 
 @wp.kernel
 def add_span_forces(
+    # Threads:
+    turn: turns.Turn,
+    tasks: wp.array(dtype=wp.vec2i),
     # Model:
     spans: wp.array(dtype=wp.vec4i),
     classes: wp.array(dtype=Any),
@@ -159,8 +153,15 @@ def add_span_forces(
     f: wp.array2d(dtype=Any),
     losses: wp.array(dtype=wp.float64),
 ):
-    """Add the forces of the springs, one thread per span; for the CPU, where spans run one after another."""
-    index = wp.tid()
-    span = spans[index]
-    c = classes[span[3]]
-    _add_span(x, v, f, losses, index, span[0], span[1], span[2], c[0], c[1], c[2], loss_weight)
+    """Add the forces of the springs of some tasks (first span, end), launched over tasks; for the CPU.
+
+    There the springs of a task run one after another, so that adds need not be atomic.
+    """
+    task = wp.tid()
+    mine = turns.take(turn, task)
+    if mine:
+        for index in range(tasks[task][0], tasks[task][1]):
+            span = spans[index]
+            c = classes[span[3]]
+            _add_span(x, v, f, losses, index, span[0], span[1], span[2], c[0], c[1], c[2], loss_weight)
+    turns.leave(turn, task, mine)

@@ -19,8 +19,10 @@ import numpy as np
 import warp as wp
 
 from warpjelly.kernels import contacts, fields
+from warpjelly.kernels.turns import Turn
 
-from .model import Model, launch_spring_forces
+from .model import Model
+from .stepping import launch_spring_forces
 
 INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
 # Share of the limit that dt = "auto" takes. Away from rest springs turn and stretch, and the limit is lower: undamped
@@ -306,6 +308,7 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
     device = x.device
     v, f = wp.zeros_like(x), wp.zeros_like(x)
     losses = wp.zeros(len(model.spans), dtype=wp.float64, device=device)
+    phases = [(Turn(), wp.array([[0, len(model.spans)]], dtype=wp.vec2i, device=device))]
     classes = model.spring_classes.numpy().astype(float)
     root = np.sqrt(model.particle_inv_mass.numpy().astype(float))
     start = np.random.default_rng(0).standard_normal(x.shape) * (root > 0.0)
@@ -317,7 +320,7 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
         def multiply(vector: np.ndarray) -> np.ndarray:
             v.assign((root * vector).astype(wp.dtype_to_numpy(model.real)))
             f.zero_()
-            launch_spring_forces(model, table, x, v, f, loss_weight=0.0, losses=losses)
+            launch_spring_forces(model, table, x, v, f, phases=phases, loss_weight=0.0, losses=losses)
             return -root * f.numpy()
 
         return _lanczos(multiply, start)
