@@ -6,6 +6,7 @@ import hashlib
 import json
 import platform
 import zipfile
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from importlib import metadata
@@ -109,11 +110,26 @@ def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             named = {str(entry.get("name", number)): entry for number, entry in enumerate(value)}
             yield from _flattened(named, f"{prefix}{key}.")
-        elif key == "file":
-            digest = hashlib.sha256(Path(value).read_bytes()).hexdigest()
-            yield f"{prefix}{key}", f"{Path(value).name} (SHA-256 {digest[:16]})"
+        elif key in ("file", "grid"):
+            for name, content in _contents(Path(value)):
+                yield f"{prefix}{key}{name}", content
         else:
             yield f"{prefix}{key}", value
+
+
+def _contents(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield (key, content) of a file, whose key is empty, and of files that it names, whose keys are their names."""
+    # This takes most of a second to import, which scenes without files need not spend.
+    from .readers.companions import files_of
+
+    folder, digests = path.parent.resolve(), defaultdict[str, Any](hashlib.sha256)
+    for file in files_of(path):
+        # Where a model has moved with all that is beside it, nothing has changed.
+        place = file.parent.resolve() / file.name
+        name = place.relative_to(folder).as_posix() if place.is_relative_to(folder) else file.name
+        digests[name].update(file.read_bytes())
+    for name, digest in digests.items():
+        yield "" if name == path.name else f" {name}", f"{name} (SHA-256 {digest.hexdigest()[:16]})"
 
 
 def origin_of(device: str) -> dict[str, str]:
