@@ -7,18 +7,20 @@ import io
 import json
 import re
 import zlib
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from browsers import opened
-from pxr import Sdf, UsdGeom, UsdShade, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 from stages import cube_surface, make_scene, write_stage
 
 from warpjelly.colors import SRGB_TABLE, srgb_from_linear
 from warpjelly.errors import InputError
 from warpjelly.looks import Look, Texture
+from warpjelly.previews.legends import Legend, legend_of
 from warpjelly.previews.preview import render_preview
 from warpjelly.stage.stagefiles import open_stage
 from warpjelly.stage.usdlooks import define_look
@@ -72,6 +74,20 @@ def test_page_holds_the_stage(tmp_path: Path, color: str) -> None:
     # The volume inside the surface, from its triangles: they are all there and face outwards.
     assert np.sum(np.cross(a, b) * c) / 6 == pytest.approx(np.prod(np.ptp(points[0], axis=0)), rel=1e-3)
     assert floor[1].shape == (1, 4, 3)
+
+
+def test_page_and_pictures_say_what_the_colors_mean(tmp_path: Path) -> None:
+    """Write the range of forces and the colours of springs into the page as legends of pictures have them."""
+    scene = make_scene(output={"force_range": (0.0, 220.0)})
+    path = write_stage(tmp_path / "stage.usdc", scene, frames=2)
+    stage = Usd.Stage.Open(str(path))
+    red = Gf.Vec3d(1.0, 0.0, 0.0)
+    stage.GetDefaultPrim().SetCustomDataByKey("legend:springs", {"bend": red})
+    stage.Save()
+    expected = Legend("0", "220", "force, N", {"bend": [255, 0, 0]})
+    assert legend_of(stage) == expected
+    render_preview(path, tmp_path / "review.html")
+    assert contents(tmp_path / "review.html")[0]["legend"].items() >= asdict(expected).items()
 
 
 def test_page_stays_small(tmp_path: Path) -> None:

@@ -11,7 +11,15 @@ import pytest
 from pxr import Gf, Usd, UsdGeom, UsdShade
 from stages import cube_surface, make_scene, moved_surface, start_stage, write_stage
 
-from warpjelly.colors import COLOR_COUNT, LINEAR_TABLE, SRGB_TABLE, color_indices, linear_from_srgb, srgb_from_linear
+from warpjelly.colors import (
+    COLOR_COUNT,
+    LINEAR_TABLE,
+    SRGB_TABLE,
+    color_indices,
+    linear_from_srgb,
+    range_in_words,
+    srgb_from_linear,
+)
 from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.shapes import ShapeFrame
 from warpjelly.stage.histogram import ForceHistogram
@@ -63,6 +71,25 @@ def test_color_indices_cover_the_table() -> None:
     indices = color_indices(force, (1.0, 3.0))
     assert indices.dtype == np.int32
     assert indices.tolist() == [0, 128, 255, 0, 255, 255, 255]
+
+
+@pytest.mark.parametrize(
+    ("force_range", "words"),
+    [
+        ((0.0, 220.0), ("0", "220")),
+        ((9.9e-42, 4.68), ("0", "4.68")),
+        ((0.0, 5.0), ("0", "5")),
+        ((0.25, 12.5), ("0.25", "12.5")),
+        ((217.64, 2204.1), ("218", "2,200")),
+        ((0.000123, 0.0981), ("0.000123", "0.0981")),
+        ((0.0, 999_960.0), ("0", "1e6")),
+        ((1.96e-6, 3e-6), ("1.96e-6", "3e-6")),
+        ((-3.0, 0.001), ("-3", "0")),
+    ],
+)
+def test_forces_are_said_as_people_write_them(force_range: tuple[float, float], words: tuple[str, str]) -> None:
+    """Round to three digits, without exponents of usual numbers, and call next to nothing 0."""
+    assert range_in_words(force_range) == words
 
 
 def test_points_are_bit_exact_in_another_process(tmp_path: Path) -> None:

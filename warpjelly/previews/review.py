@@ -13,7 +13,7 @@ import html
 import json
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from importlib import resources
 from types import EllipsisType
@@ -26,6 +26,7 @@ from ..colors import SRGB_TABLE, srgb_from_linear
 from ..errors import InputError
 from ..looks import Texture
 from ..polygons import triangulate
+from .legends import legend_of
 from .solids import colors_at, diffuse, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
 
 # More than that, no browser holds.
@@ -273,16 +274,6 @@ def _camera(stage: Usd.Stage, frame: int) -> dict[str, Any]:
 
 def _legend(stage: Usd.Stage) -> dict[str, Any] | None:
     """Return what the colours mean, in sRGB."""
-    legend = stage.GetDefaultPrim().GetCustomDataByKey("legend") if stage.GetDefaultPrim() else None
-    if not legend:
+    if (legend := legend_of(stage)) is None:
         return None
-    return {
-        "low": f"{legend['range'][0]:.2g}",
-        "high": f"{legend['range'][1]:.2g}",
-        "caption": f"{legend['quantity']}, {legend['unit']}",
-        "colors": np.rint(SRGB_TABLE[::15] * 255).astype(int).tolist(),
-        "springs": {
-            name: np.rint(srgb_from_linear(np.array(color)) * 255).astype(int).tolist()
-            for name, color in legend.get("springs", {}).items()
-        },
-    }
+    return asdict(legend) | {"colors": np.rint(SRGB_TABLE[::15] * 255).astype(int).tolist()}

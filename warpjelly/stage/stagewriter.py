@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd
 
+from ..colors import range_in_words
 from ..errors import EnvironmentFailedError, InputError
 from ..files import whole_file
 from ..plan import clip_length
@@ -193,9 +194,9 @@ class StageWriter:
             self._fixed_range = tuple(stage.GetPrimAtPath(WORLD).GetCustomDataByKey("legend")["range"])
             if self._scene.frame_count > self._frame_count:
                 log.warning(
-                    "%s: colours keep the range of the first %d frames, %.3g to %.3g N, whose forces were not kept; "
+                    "%s: colours keep the range of the first %d frames, %s to %s N, whose forces were not kept; "
                     "with output.forces = true they would be",
-                    *(self._folder, self._frame_count, *self._fixed_range),
+                    *(self._folder, self._frame_count, *range_in_words(self._fixed_range)),
                 )
 
     def _force_range(self) -> tuple[float, float]:
