@@ -202,3 +202,32 @@ def test_page_plays_from_disk(tmp_path: Path) -> None:
         page.keyboard.press("ArrowLeft")
         page.wait_for_function("player.frame === 8")
         assert complaints == []
+
+
+@pytest.mark.browser
+def test_page_fits_a_phone(tmp_path: Path) -> None:
+    """Leave room for all controls of a narrow window, and zoom with two fingers as far as they part."""
+    render_preview(write_stage(tmp_path / "stage.usdc"), tmp_path / "r.html")
+    with opened(tmp_path / "r.html") as (page, complaints):
+        page.set_viewport_size({"width": 390, "height": 700})
+        page.wait_for_function("byId('time').textContent !== ''")
+        title, tips, scrub = (page.locator(name).bounding_box() for name in ("#title", "#help", "#scrub"))
+        assert title["y"] + title["height"] <= tips["y"]
+        assert scrub["width"] > 200
+        fingers = page.context.new_cdp_session(page)
+
+        def touch(kind: str, *apart: int) -> None:
+            points = [{"x": 195 + side * apart[0], "y": 300, "id": side} for side in (-1, 1)] if apart else []
+            fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        target, before = page.evaluate("[camera.target, Math.hypot(...camera.offset)]")
+        touch("touchStart", 40)
+        touch("touchMove", 60)
+        touch("touchMove", 80)
+        touch("touchEnd")
+        page.wait_for_function(f"Math.hypot(...camera.offset) < {0.51 * before}")
+        now, distance = page.evaluate("[camera.target, Math.hypot(...camera.offset)]")
+        assert distance == pytest.approx(before / 2)
+        # The fingers move one after the other; with the first one the middle moves by 10 of 700 pixels, and back again.
+        np.testing.assert_allclose(now, target, rtol=0, atol=0.01 * before)
+        assert complaints == []
