@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import json
+import platform
 from collections.abc import Callable, Iterator
+from importlib import metadata
 from pathlib import Path
 
 import lightusd
@@ -10,12 +13,14 @@ import numpy as np
 import pytest
 import usd_validation_nvidia as nvidia
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
+from runs import samples_of
 from stages import write_stage
 
 from warpjelly.run import RunEndedError, simulate
+from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
 from warpjelly.stage.pack import FORMATS, pack
-from warpjelly.stage.stagefiles import find_stage
+from warpjelly.stage.stagefiles import find_stage, open_stage
 from warpjelly.stage.validate import stage_problems
 
 SCENES = Path(__file__).parent.parent / "scenes"
@@ -29,14 +34,18 @@ SURFACE = "/World/bodies/cube/surface"
 DISABLED_RULES = {"IndexedPrimvarChecker", "UnusedPrimvarChecker"}
 
 
+def scene_of(name: str) -> Scene:
+    """Return a scene with as many frames as are looked at."""
+    return load_scene(SCENES / f"{name}.toml", frames=60 if name == DIVERGES else FRAMES)
+
+
 @pytest.fixture(scope="module")
 def gallery(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run each scene for a moment, and return the folder of the run directories."""
     folder = tmp_path_factory.mktemp("gallery")
     for name in NAMES:
-        scene = load_scene(SCENES / f"{name}.toml", frames=60 if name == DIVERGES else FRAMES)
         try:
-            simulate(scene, output=folder / name, device="cpu")
+            simulate(scene_of(name), output=folder / name, device="cpu")
         except RunEndedError:
             assert name == DIVERGES
     return folder
@@ -121,6 +130,29 @@ def test_another_reader_reads_the_same(gallery: Path, tmp_path: Path, name: str)
     assert list(differences(lightusd.load(str(tmp_path / "packed.usdc")), stage)) == []
     times = {time for prim in stage.Traverse() for each in prim.GetAttributes() for time in each.GetTimeSamples()}
     assert times == set(range(int(stage.GetEndTimeCode()) + 1)) > {0, 1}
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stage_says_where_it_comes_from(gallery: Path, name: str) -> None:
+    """Find scene, versions and device in the record and in the stage alike, and the same scene in them again."""
+    record = json.loads((gallery / name / "run.json").read_text())
+    stage = open_stage(gallery / name)
+    stored = stage.GetDefaultPrim().GetCustomDataByKey("provenance")
+    assert {key: json.loads(stored[key]) for key in ("resolved_scene", "versions")}.items() <= record.items()
+    assert (stored["device"], stored["machine"]) == (record["device"], record["machine"]) == ("cpu", platform.machine())
+    assert record["versions"]["warp-lang"] == metadata.version("warp-lang")
+    scene = Scene.model_validate(record["resolved_scene"])
+    assert scene.model_dump(mode="json", exclude={"gravity"}) == scene_of(name).model_dump(
+        mode="json", exclude={"gravity"}
+    )
+    np.testing.assert_array_equal(scene.gravity_vector, scene_of(name).gravity_vector)
+
+
+def test_a_run_is_repeated_from_its_record(gallery: Path, tmp_path: Path) -> None:
+    """Simulate what the record says, and get the same stage to the bit."""
+    record = json.loads((gallery / "creature_drop" / "run.json").read_text())
+    simulate(Scene.model_validate(record["resolved_scene"]), output=tmp_path, device=record["device"])
+    assert samples_of(tmp_path) == samples_of(gallery / "creature_drop")
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
