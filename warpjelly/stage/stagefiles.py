@@ -7,12 +7,14 @@ going. Whatever is opened first then holds: the root of the parts is there from 
 from __future__ import annotations
 
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from pxr import Sdf, Tf, Usd
+from pxr import Sdf, Tf, Usd, UsdUtils
 
 from ..errors import EnvironmentFailedError, InputError, reason
-from ..files import whole_file
+from ..files import missing, whole_file
 from .prims import WORLD
 
 STAGE_NAME = "stage.usdc"
@@ -52,18 +54,46 @@ def find_stage(source: Path) -> Path:
     raise InputError(f"{source}: no {STAGE_NAME} or {ROOT_NAME} in this directory")
 
 
+@contextmanager
+def silent_usd() -> Iterator[None]:
+    """Keep USD from printing what it stumbles over; what matters of it is said otherwise."""
+    delegate = UsdUtils.CoalescingDiagnosticDelegate()
+    try:
+        yield
+    finally:
+        # It is silent as long as this lives.
+        del delegate
+
+
 def open_stage(source: Path) -> Usd.Stage:
     """Open a stage file, or the stage of a run directory, whether or not the run has finished.
+
+    Of its parts some may be missing: ``validate.py`` says so.
 
     Raises:
         InputError: there is none, or it is not a USD file.
     """
     path = find_stage(source)
     try:
-        stage = Usd.Stage.Open(str(path))
-        # USD shares what it has read of a file within a process, even after the file was replaced.
-        stage.Reload()
+        with silent_usd():
+            stage = Usd.Stage.Open(str(path))
+            # USD shares what it has read of a file within a process, even after the file was replaced.
+            stage.Reload()
         return stage
+    except Tf.ErrorException as error:
+        raise InputError(f"{path}: not a readable USD file: {reason(error)}") from error
+
+
+def open_clip(path: Path) -> Sdf.Layer:
+    """Open a clip, as it is now.
+
+    Raises:
+        InputError: it is missing or damaged.
+    """
+    if why := missing(path):
+        raise InputError(f"{path}: {why}")
+    try:
+        return Sdf.Layer.OpenAsAnonymous(str(path))
     except Tf.ErrorException as error:
         raise InputError(f"{path}: not a readable USD file: {reason(error)}") from error
 
@@ -80,9 +110,9 @@ def set_progress(stage: Usd.Stage, frames: int, of: int) -> None:
 
 
 def active_clips(stage: Usd.Stage) -> list[tuple[int, Path]]:
-    """Return the first frame and the file of each clip of a stage in parts, in order."""
-    clips = Usd.ClipsAPI(stage.GetPrimAtPath(WORLD))
-    files = [Path(asset.resolvedPath) for asset in clips.GetClipAssetPaths() or []]
+    """Return the first frame and the file of each clip of a stage in parts, in order, whether or not it is there."""
+    clips, root = Usd.ClipsAPI(stage.GetPrimAtPath(WORLD)), stage.GetRootLayer()
+    files = [Path(root.ComputeAbsolutePath(asset.path)) for asset in clips.GetClipAssetPaths() or []]
     return [(int(start), files[int(number)]) for start, number in clips.GetClipActive() or []]
 
 

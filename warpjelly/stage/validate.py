@@ -9,7 +9,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
 
 from ..errors import reason
-from .stagefiles import open_stage
+from .stagefiles import open_stage, silent_usd
 
 # The newest crate version that common viewers open.
 MAX_CRATE_VERSION = (0, 8, 0)
@@ -29,8 +29,9 @@ def stage_problems(path: Path) -> list[str]:
     stage = open_stage(path)
     found: list[str] = []
     try:
-        for check in (_files, _usd_validators, _metadata, _structure, _shapes):
-            found += check(stage)
+        with silent_usd():
+            for check in (_files, _usd_validators, _metadata, _structure, _shapes):
+                found += check(stage)
     except Tf.ErrorException as error:
         found.append(f"the file is damaged: {reason(error)}")
     return found
