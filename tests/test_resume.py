@@ -330,6 +330,24 @@ def test_all_files_of_a_model_are_compared(tmp_path, model, changed):
         file.write_bytes(content)
 
 
+@pytest.mark.parametrize(
+    ("model", "content"),
+    [
+        ("a.obj", "mtllib gone.mtl " + 300 * "a"),
+        ("a.obj", "mtllib a\0b"),
+        ("a.gltf", '{"images": [{"uri": "gone.png"}, {"uri": "data:,"}, {"bufferView": 0}], "buffers": [{}]}'),
+        ("a.dae", "<init_from>gone.png</init_from><init_from/>"),
+        ("a.usda", '#usda 1.0\n(subLayers = [@gone.usda@])\ndef Shader "s" {\n asset inputs:file = @gone.png@\n}'),
+        ("a.stl", "no other files"),
+    ],
+)
+def test_missing_files_of_a_model_are_passed_over(tmp_path, capfd, model, content):
+    """Leave what is missing to the reader of the model, which says so, also names that no file can have."""
+    (tmp_path / model).write_text(content)
+    assert files_of(tmp_path / model) == [tmp_path / model]
+    assert capfd.readouterr().err == ""
+
+
 def test_a_broken_model_does_not_go_on(tmp_path):
     """Say in one line that a model is broken of which nobody knows what it was read from."""
     write_models(tmp_path / "a")

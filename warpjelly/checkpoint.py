@@ -18,6 +18,7 @@ import numpy as np
 from .errors import InputError
 from .files import whole_file
 from .model import State
+from .readers.companions import files_of
 from .scene import Scene
 from .simulator import Simulator
 
@@ -119,17 +120,15 @@ def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
 
 def _contents(path: Path) -> Iterator[tuple[str, str]]:
     """Yield (key, content) of a file, whose key is empty, and of files that it names, whose keys are their names."""
-    # This takes most of a second to import, which scenes without files need not spend.
-    from .readers.companions import files_of
-
-    folder, digests = path.parent.resolve(), defaultdict[str, Any](hashlib.sha256)
+    folder, digests = path.parent.resolve(), defaultdict[str, list[str]](list)
     for file in files_of(path):
         # Where a model has moved with all that is beside it, nothing has changed.
         place = file.parent.resolve() / file.name
         name = place.relative_to(folder).as_posix() if place.is_relative_to(folder) else file.name
-        digests[name].update(file.read_bytes())
-    for name, digest in digests.items():
-        yield "" if name == path.name else f" {name}", f"{name} (SHA-256 {digest.hexdigest()[:16]})"
+        with open(file, "rb") as content:
+            digests[name].append(hashlib.file_digest(content, "sha256").hexdigest()[:16])
+    for name, found in digests.items():
+        yield "" if name == path.name else f" {name}", f"{name} (SHA-256 {', '.join(found)})"
 
 
 def origin_of(device: str) -> dict[str, str]:

@@ -12,9 +12,6 @@ from urllib.parse import unquote
 from ..errors import SceneError, reason
 from ..looks import image_file
 from ..scene import USD_EXTENSIONS
-from .gltffile import gltf_addresses
-from .mtlfile import mtl_images
-from .polygonfiles import obj_libraries
 
 
 def files_of(model: Path) -> list[Path]:
@@ -31,19 +28,28 @@ def files_of(model: Path) -> list[Path]:
         others = named(model)
     # As where models are read, parsing trips over whatever a broken file has.
     except Exception as error:
-        raise SceneError(
-            f"{model}: not a sound {model.suffix} file: {reason(error) or type(error).__name__}"
-        ) from error
-    readable = (file for file in others if file.is_file() and os.access(file, os.R_OK))
-    return [model, *dict.fromkeys(file for file in readable if not file.samefile(model))]
+        why = reason(error) or type(error).__name__
+        raise SceneError(f"{model}: not a sound {model.suffix} file: {why}") from error
+    return [model, *dict.fromkeys(file for file in others if _readable(file) and not file.samefile(model))]
 
 
+def _readable(file: Path) -> bool:
+    # Unlike pathlib's, this one takes names that no file can have.
+    return os.path.isfile(file) and os.access(file, os.R_OK)
+
+
+# Readers take long to import, and most scenes need none or one of them.
 def _gltf(model: Path) -> list[Path]:
+    from .gltffile import gltf_addresses
+
     return [image_file(model, Path(address)) for address in gltf_addresses(model)]
 
 
 def _obj(model: Path) -> list[Path]:
-    libraries = [file for file in obj_libraries(model) if file.is_file()]
+    from .mtlfile import mtl_images
+    from .polygonfiles import obj_libraries
+
+    libraries = [file for file in obj_libraries(model) if _readable(file)]
     images = [image_file(file, Path(name.replace("\\", "/"))) for file in libraries for name in mtl_images(file)]
     return [*libraries, *images]
 
@@ -57,7 +63,11 @@ def _dae(model: Path) -> list[Path]:
 def _usd(model: Path) -> list[Path]:
     from pxr import UsdUtils
 
-    layers, assets, _ = UsdUtils.ComputeAllDependencies(str(model))
+    from ..stage.stagefiles import silent_usd
+
+    # What is missing is said where the model is read.
+    with silent_usd():
+        layers, assets, _ = UsdUtils.ComputeAllDependencies(str(model))
     # What is in a package has the path of that package in front.
     return [Path(path.partition("[")[0]) for path in (*(layer.realPath for layer in layers), *assets)]
 
