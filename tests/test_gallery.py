@@ -64,7 +64,7 @@ def validator() -> nvidia.ValidationEngine:
 
 def found_by(validator: nvidia.ValidationEngine, path: Path) -> list[str]:
     """Return what NVIDIA's validator says of a stage, warnings too."""
-    return [str(issue) for issue in validator.validate(str(path)).issues()]
+    return [f"{issue.rule.__name__}: {issue.message}" for issue in validator.validate(str(path)).issues()]
 
 
 def differences(light: lightusd.Stage, stage: Usd.Stage) -> Iterator[str]:
@@ -129,7 +129,8 @@ def test_another_reader_reads_the_same(gallery: Path, tmp_path: Path, name: str)
     stage = Usd.Stage.Open(str(tmp_path / "packed.usdc"))
     assert list(differences(lightusd.load(str(tmp_path / "packed.usdc")), stage)) == []
     times = {time for prim in stage.Traverse() for each in prim.GetAttributes() for time in each.GetTimeSamples()}
-    assert times == set(range(int(stage.GetEndTimeCode()) + 1)) > {0, 1}
+    frames = json.loads((gallery / name / "run.json").read_text())["frames"]
+    assert times >= {stage.GetStartTimeCode() + frame for frame in range(frames)} > {stage.GetStartTimeCode()}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -237,5 +238,4 @@ def test_what_is_broken_is_found(tmp_path: Path, validator: nvidia.ValidationEng
     assert found_by(validator, tmp_path / "stage.usdc") == []
     DEFECTS[rule](stage)
     stage.Save()
-    found = validator.validate(str(tmp_path / "stage.usdc")).issues()
-    assert rule in {issue.rule.__name__ for issue in found}
+    assert any(said.startswith(f"{rule}: ") for said in found_by(validator, tmp_path / "stage.usdc"))
