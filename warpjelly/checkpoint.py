@@ -109,7 +109,7 @@ def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             named = {str(entry.get("name", number)): entry for number, entry in enumerate(value)}
             yield from _flattened(named, f"{prefix}{key}.")
-        elif key == "file":
+        elif key in ("file", "over"):
             digest = hashlib.sha256(Path(value).read_bytes()).hexdigest()
             yield f"{prefix}{key}", f"{Path(value).name} (SHA-256 {digest[:16]})"
         else:
