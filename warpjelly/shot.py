@@ -75,11 +75,12 @@ class Shot:
 
     def moves(self, path: str) -> bool:
         """Say whether the place of a prim changes with time."""
-        cache, prim = UsdGeom.XformCache(), self.stage.GetPrimAtPath(path)
+        prim = self.stage.GetPrimAtPath(path)
         while prim and not prim.IsPseudoRoot():
-            if cache.TransformMightBeTimeVarying(prim):
+            xformable = UsdGeom.Xformable(prim)
+            if xformable and xformable.TransformMightBeTimeVarying():
                 return True
-            prim = Usd.Prim() if cache.GetResetXformStack(prim) else prim.GetParent()
+            prim = Usd.Prim() if xformable and xformable.GetResetXformStack() else prim.GetParent()
         return False
 
     def require_mesh(self, path: str, body: str, frame_count: int) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom
+from pxr import Sdf, Usd, UsdGeom, Vt
 
 from ..polygons import moved, unit
 from ..scene import Scene
@@ -20,8 +20,8 @@ from .stagefiles import OVER_NAME, STAGE_NAME, TEXTURES_NAME, set_note
 from .surroundings import define_camera, define_colliders
 from .usd import FORCE, NORMALS, author_sample, declare_samples, define_rest, legend, set_metadata, shape_path, storable
 
-# What a root does not take from that of the shot: both layers are part of it.
-_OF_THE_LAYER = ("subLayers", "subLayerOffsets", "layerRelocates")
+# What a root does not take from that of the shot, which is in the stage with all that it says itself.
+_OF_THE_LAYER = ("subLayers", "subLayerOffsets", "layerRelocates", "comment", "documentation")
 # What a mesh may say that its old motion or shape is in, and that is not true of the new one.
 _DEFORMED = ("normals", NORMALS, f"{NORMALS}:indices", "velocities", "accelerations")
 
@@ -170,7 +170,7 @@ class Over:
                 layer.pseudoRoot.SetInfo(key, shot.GetInfo(key))
         # Without these a sublayer and its root would not have the same time.
         layer.timeCodesPerSecond = self._shot.stage.GetTimeCodesPerSecond()
-        set_note(layer, "over", [str(path) for path in self.clip_prims])
+        set_note(layer, "over", Vt.StringArray([str(path) for path in self.clip_prims]))
 
     def define_rest(
         self, layer: Sdf.Layer, rest: Sequence[ShapeFrame], provenance: Mapping[str, object], folder: Path
