@@ -187,7 +187,14 @@ def _open_shot(scene: Scene) -> Shot | None:
     # USD takes long to import, and planning other scenes does without.
     from .shot import Shot
 
-    return Shot(scene)
+    shot = Shot(scene)
+    if ends := shot.after(scene.frame_count):
+        log.warning(
+            "%s: the simulation ends at time code %g and the shot at %g; what it moved rests in between",
+            shot.path,
+            *ends,
+        )
+    return shot
 
 
 def _require_meshes(shot: Shot, plan: Plan) -> None:

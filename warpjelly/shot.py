@@ -57,6 +57,11 @@ class Shot:
         """Return the frame nearest to a time code."""
         return round((time - self.start) * self._fps / self.stage.GetTimeCodesPerSecond())
 
+    def after(self, frame_count: int) -> tuple[float, float] | None:
+        """Return the time codes where so many frames and where the shot end, if the shot is longer."""
+        last, end = self.time(frame_count - 1), self.stage.GetEndTimeCode()
+        return (last, end) if last < end else None
+
     def time_range(self, frame_count: int) -> tuple[float, float]:
         """Return the first and the last time code of the shot and so many frames."""
         first, last = self.start, self.time(max(frame_count - 1, 0))

@@ -67,8 +67,11 @@ def open_stage(source: Path) -> Usd.Stage:
     """
     path = find_stage(source)
     try:
-        stage = Usd.Stage.Open(str(path))
-        # USD shares what it has read of a file within a process, even after the file was replaced.
+        # USD shares what it has read of a file within a process, even after the file was replaced. The root goes first:
+        # what it named before may be gone.
+        root = Sdf.Layer.FindOrOpen(str(path))
+        root.Reload()
+        stage = Usd.Stage.Open(root)
         stage.Reload()
         return stage
     except Tf.ErrorException as error:

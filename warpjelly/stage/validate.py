@@ -48,7 +48,7 @@ def _over_shapes(stage: Usd.Stage) -> Iterator[str]:
     for path in overridden(stage):
         prim = stage.GetPrimAtPath(path)
         if not prim.IsA(UsdGeom.Mesh):
-            yield f"{path}: not a mesh any more, so its motion is lost"
+            yield f"{path}: no mesh is there any more, so its motion is not seen"
             continue
         times = UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples()
         problems = ((time, problem) for time in times for problem in _sample(UsdGeom.Mesh(prim), Usd.TimeCode(time)))
