@@ -64,7 +64,7 @@ def validator() -> nvidia.ValidationEngine:
 
 def found_by(validator: nvidia.ValidationEngine, path: Path) -> list[str]:
     """Return what NVIDIA's validator says of a stage, warnings too."""
-    return [str(issue) for issue in validator.validate(str(path)).issues()]
+    return [f"{issue.rule.__name__}: {issue.message}" for issue in validator.validate(str(path)).issues()]
 
 
 def differences(light: lightusd.Stage, stage: Usd.Stage) -> Iterator[str]:
@@ -117,9 +117,10 @@ def _in_a_row(value: object) -> np.ndarray:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_stage_of_every_scene_is_sound(gallery: Path, validator: nvidia.ValidationEngine, name: str) -> None:
-    """Find no problem with the project's own checks, nor with NVIDIA's."""
+    """Find no problem with the project's own checks, nor with NVIDIA's but those that a shot had before."""
     assert stage_problems(gallery / name) == []
-    assert found_by(validator, find_stage(gallery / name)) == []
+    shot = scene_of(name).output.over
+    assert found_by(validator, find_stage(gallery / name)) == ([] if shot is None else found_by(validator, shot))
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -129,7 +130,8 @@ def test_another_reader_reads_the_same(gallery: Path, tmp_path: Path, name: str)
     stage = Usd.Stage.Open(str(tmp_path / "packed.usdc"))
     assert list(differences(lightusd.load(str(tmp_path / "packed.usdc")), stage)) == []
     times = {time for prim in stage.Traverse() for each in prim.GetAttributes() for time in each.GetTimeSamples()}
-    assert times == set(range(int(stage.GetEndTimeCode()) + 1)) > {0, 1}
+    frames = json.loads((gallery / name / "run.json").read_text())["frames"]
+    assert times >= {stage.GetStartTimeCode() + frame for frame in range(frames)} > {stage.GetStartTimeCode()}
 
 
 @pytest.mark.parametrize("name", NAMES)
@@ -137,7 +139,9 @@ def test_a_stage_says_where_it_comes_from(gallery: Path, name: str) -> None:
     """Find scene, versions and device in the record and in the stage alike, and the same scene in them again."""
     record = json.loads((gallery / name / "run.json").read_text())
     stage = open_stage(gallery / name)
-    stored = stage.GetDefaultPrim().GetCustomDataByKey("provenance")
+    # Over a shot nothing but a layer is the run's own.
+    noted = [layer.customLayerData.get("warpjelly", {}).get("provenance") for layer in stage.GetUsedLayers()]
+    stored = stage.GetDefaultPrim().GetCustomDataByKey("provenance") or next(filter(None, noted))
     assert {key: json.loads(stored[key]) for key in ("resolved_scene", "versions")}.items() <= record.items()
     assert (stored["device"], stored["machine"]) == (record["device"], record["machine"]) == ("cpu", platform.machine())
     assert record["versions"]["warp-lang"] == metadata.version("warp-lang")
@@ -237,5 +241,4 @@ def test_what_is_broken_is_found(tmp_path: Path, validator: nvidia.ValidationEng
     assert found_by(validator, tmp_path / "stage.usdc") == []
     DEFECTS[rule](stage)
     stage.Save()
-    found = validator.validate(str(tmp_path / "stage.usdc")).issues()
-    assert rule in {issue.rule.__name__ for issue in found}
+    assert any(said.startswith(f"{rule}: ") for said in found_by(validator, tmp_path / "stage.usdc"))
