@@ -30,7 +30,7 @@ GRAVITY = np.array([0.0, 0.0, -9.81])
 # What a run may say of a mesh.
 WRITTEN = {"points", "extent", "primvars:normals", "primvars:normals:indices", "normals", "velocities", "accelerations"}
 FINISHED = ["checkpoint.npz", "metrics.csv", "override.usdc", "run.json", "stage.usda"]
-# So many substeps that a run takes a while.
+# So many substeps that a run takes a while, and that small cells are stable.
 SLOW = {"solver__dt": 1e-4}
 # A run like that with short clips in a process of its own: shot, run directory.
 SCRIPT = """
@@ -208,7 +208,11 @@ def test_tools_take_it(run, tmp_path):
     render_preview(run, tmp_path / "page.html")
     assert (tmp_path / "page.html").stat().st_size > 10_000
     shutil.copytree(run, tmp_path / "alone")
-    assert any("shot.usda is missing" in problem for problem in stage_problems(tmp_path / "alone"))
+    for tool in (stage_problems, lambda source: pack(source, tmp_path / "alone.usdc")):
+        with pytest.raises(
+            InputError, match=r"shot\.usda is missing; a run over a shot and the shot have to move together"
+        ):
+            tool(tmp_path / "alone")
 
 
 @pytest.mark.egl
@@ -311,6 +315,31 @@ def test_one_kind_of_run_replaces_the_other(tmp_path):
     assert files(tmp_path / "run") == FINISHED
 
 
+def test_a_run_goes_over_another(tmp_path):
+    """Move one mesh over a run that moved the other, and find both motions and the shot."""
+    shot = make_shot(tmp_path / "shot.usda")
+    simulate(shot_scene(shot, bodies__0__prim=HARD, **SLOW), output=tmp_path / "first", device="cpu")
+    first = tmp_path / "first" / "stage.usda"
+    simulate(shot_scene(first, bodies__0__prim=SMOOTH, **SLOW), output=tmp_path / "second", device="cpu")
+    before, after = samples_of(tmp_path / "first"), samples_of(tmp_path / "second")
+    moved = {key: value for key, value in before.items() if key[0].startswith(HARD)}
+    assert moved.items() <= after.items()
+    times = [START + frame * RATE / FPS for frame in range(FRAMES)]
+    assert [code for path, code in after if path == f"{SMOOTH}.points"] == times
+    assert stage_problems(tmp_path / "second") == []
+
+
+@pytest.mark.parametrize("options", [{}, {"force": True}, {"resume": True}])
+def test_a_shot_is_not_replaced(tmp_path, options):
+    """Refuse to write a run into the folder of the shot, whose names the run's own may be."""
+    shot = make_shot(tmp_path / "stage.usda")
+    content = shot.read_bytes()
+    with pytest.raises(InputError, match=r"the shot of output\.over is in this folder; choose another with -o"):
+        simulate(shot_scene(shot), output=tmp_path, device="cpu", **options)
+    assert shot.read_bytes() == content
+    assert os.listdir(tmp_path) == ["stage.usda"]
+
+
 def test_check_says_where_it_will_be(tmp_path, caplog):
     """Name the meshes and the time codes, and warn of a shot that goes on after the simulation."""
     figures = forecast(shot_scene(make_shot(tmp_path / "shot.usda")), device="cpu")
@@ -345,6 +374,7 @@ NETWORK = {"type": "network", "material": "jelly", "points": [[0.0, 0.0, 0.0]]}
         ({"output__over": "drop.obj"}, r"output\.over = .*must be a USD stage"),
         ({"output__over": "nothing.usda"}, r"output\.over = .*no such file"),
         ({"up_axis": "Y"}, r"up_axis = \"Y\": the shot, .* has Z up"),
+        ({"bodies__0__prim": "rig"}, r"'rig' is not the path of a prim"),
         (
             {"bodies__0__prim": "/set/nothing"},
             r"no prim /set/nothing; meshes in this file: /set/rig/inner/smooth, /set/rig/hard",

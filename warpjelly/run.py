@@ -107,6 +107,8 @@ def simulate(
     folder = Path(output) if output is not None else Path("outputs") / scene.name
     if folder.exists() and not folder.is_dir():
         raise EnvironmentFailedError(f"{folder}: cannot write the run: it is a file; choose a folder with -o")
+    if scene.output.over is not None and folder.resolve() in scene.output.over.resolve().parents:
+        raise InputError(f"{folder}: the shot of output.over is in this folder; choose another with -o")
     if force and resume:
         raise InputError("--resume goes on with a run, --force replaces it: give one of them")
     try:

@@ -6,10 +6,10 @@ import math
 from pathlib import Path
 
 import numpy as np
-from pxr import Tf, Usd, UsdGeom, UsdSkel, UsdUtils
+from pxr import Sdf, Tf, Usd, UsdGeom, UsdSkel, UsdUtils
 
 from .errors import SceneError, reason
-from .scene import Scene
+from .scene import ModelBody, Scene
 
 # Transforms that squeeze space by more than this share have no inverse to speak of.
 _LEAST_SQUEEZE = 1e-9
@@ -31,7 +31,12 @@ class Shot:
         # While this lives, USD prints nothing itself; reading the meshes warns of what is missing.
         silence = UsdUtils.CoalescingDiagnosticDelegate()
         try:
-            self.stage = Usd.Stage.Open(str(self.path))
+            # Shots are large, and of all but the bodies nothing is needed.
+            prims = [Sdf.Path(str(body.prim)) for body in scene.bodies if isinstance(body, ModelBody) and body.prim]
+            mask = Usd.StagePopulationMask(
+                [prim for prim in prims if prim.IsAbsolutePath() and prim.IsAbsoluteRootOrPrimPath()]
+            )
+            self.stage = Usd.Stage.OpenMasked(str(self.path), mask)
             # USD shares what it has read of a file within a process, even after the file was replaced.
             self.stage.Reload()
         except Tf.ErrorException as error:

@@ -11,12 +11,12 @@ from typing import Protocol
 import numpy as np
 from pxr import Sdf, Usd, UsdGeom, Vt
 
-from ..polygons import moved, unit
+from ..polygons import unit
 from ..scene import Scene
 from ..shapes import Shape, ShapeFrame
 from ..shot import Shot
 from .prims import WORLD, integers, vectors
-from .stagefiles import OVER_NAME, STAGE_NAME, TEXTURES_NAME, set_note
+from .stagefiles import OVER_NAME, STAGE_NAME, TEXTURES_NAME, remove_notes, set_note
 from .surroundings import define_camera, define_colliders
 from .usd import FORCE, NORMALS, author_sample, declare_samples, define_rest, legend, set_metadata, shape_path, storable
 
@@ -168,7 +168,9 @@ class Over:
         for key in shot.ListInfoKeys():
             if key not in _OF_THE_LAYER:
                 layer.pseudoRoot.SetInfo(key, shot.GetInfo(key))
-        # Without these a sublayer and its root would not have the same time.
+        # Of a run that this one goes over.
+        remove_notes(layer)
+        # A sublayer and its root have the same time only where both say so.
         layer.timeCodesPerSecond = self._shot.stage.GetTimeCodesPerSecond()
         set_note(layer, "over", Vt.StringArray([str(path) for path in self.clip_prims]))
 
@@ -210,22 +212,38 @@ class Over:
         """Take nothing over."""
 
     def _placed(self, shape: Shape, frame: int, sample: ShapeFrame) -> ShapeFrame:
-        """Return a sample in the space of its mesh at a frame, per second of the shot."""
+        """Return what is written of a sample in the space of its mesh at a frame, velocities per second."""
         path = str(shape_path(shape))
         matrix = self._shot.matrix(path, frame)
         inverse, points = np.linalg.inv(matrix), sample.points.astype(float)
-        velocities = sample.velocities @ inverse[:3, :3].T
-        if path in self._moving:
-            # What stands still in the scene moves against a space that moves.
-            before, after = (np.linalg.inv(self._shot.matrix(path, frame + half)) for half in (-0.5, 0.5))
-            velocities += moved(points, after - before) * self._scene.fps
-        # Areas turn by the inverse transpose, and change sides where space is mirrored.
-        outward = -1.0 if self._is_left_handed(path) else 1.0
-        normals = unit(sample.normals @ matrix[:3, :3]) * np.sign(np.linalg.det(matrix[:3, :3])) * outward
-        return replace(sample, points=moved(points, inverse), normals=normals, velocities=velocities)
+        placed = replace(sample, points=_moved(points, inverse))
+        if self._scene.output.velocities:
+            velocities = _turned(sample.velocities, inverse)
+            if path in self._moving:
+                # What stands still in the scene moves against a space that moves.
+                before, after = (np.linalg.inv(self._shot.matrix(path, frame + half)) for half in (-0.5, 0.5))
+                velocities += (_moved(points, after) - _moved(points, before)) * self._scene.fps
+            placed = replace(placed, velocities=velocities)
+        if shape.corner_normals is not None:
+            # Areas turn by the inverse transpose, and change sides where space is mirrored.
+            left_handed = self._shot.mesh(path).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded
+            side = np.sign(np.linalg.det(matrix[:3, :3])) * (-1.0 if left_handed else 1.0)
+            placed = replace(placed, normals=unit(_turned(sample.normals, matrix.T)) * side)
+        return placed
 
-    def _is_left_handed(self, path: str) -> bool:
-        return bool(self._shot.mesh(path).GetOrientationAttr().Get() == UsdGeom.Tokens.leftHanded)
+
+def _moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Move points [count, 3] by a matrix for column vectors, [4, 4]."""
+    moved = _turned(points, matrix)
+    moved += matrix[:3, 3]
+    return moved
+
+
+def _turned(vectors: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Return what a matrix for column vectors, [4, 4], makes of directions [count, 3]."""
+    # Matrix products would share this among threads that wait for each other where others work.
+    turned: np.ndarray = np.einsum("ij,kj->ki", matrix[:3, :3], vectors)
+    return turned
 
 
 def _path_between(folder: Path, file: Path) -> str:

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from pxr import Sdf, Tf, Usd, UsdUtils
+from pxr import Ar, Sdf, Tf, Usd, UsdUtils
 
 from ..errors import EnvironmentFailedError, InputError, reason
 from ..files import missing, whole_file
@@ -77,7 +77,7 @@ def open_stage(source: Path) -> Usd.Stage:
     Of its parts some may be missing: ``validate.py`` says so.
 
     Raises:
-        InputError: there is none, or it is not a USD file.
+        InputError: there is none, it is not a USD file, or it goes over a shot that is not there.
     """
     path = find_stage(source)
     try:
@@ -86,6 +86,7 @@ def open_stage(source: Path) -> Usd.Stage:
             # first: what it named before may be gone.
             root = Sdf.Layer.FindOrOpen(str(path))
             root.Reload()
+            _require_shot(path, root)
             stage = Usd.Stage.Open(root)
             stage.Reload()
         return stage
@@ -113,13 +114,25 @@ def set_note(layer: Sdf.Layer, key: str, value: object) -> None:
     layer.customLayerData = {**notes, _NOTES: {**notes.get(_NOTES, {}), key: value}}
 
 
-def _note(stage: Usd.Stage, key: str) -> Any:
-    return stage.GetRootLayer().customLayerData.get(_NOTES, {}).get(key)
+def remove_notes(layer: Sdf.Layer) -> None:
+    """Remove what was noted in the custom data of a layer."""
+    layer.customLayerData = {key: value for key, value in layer.customLayerData.items() if key != _NOTES}
+
+
+def _note(layer: Sdf.Layer, key: str) -> Any:
+    return layer.customLayerData.get(_NOTES, {}).get(key)
+
+
+def _require_shot(path: Path, root: Sdf.Layer) -> None:
+    """Refuse the root of a run over a shot that is not there: USD would only warn, and show nothing."""
+    for layer in root.subLayerPaths if _note(root, "over") else ():
+        if not Ar.GetResolver().Resolve(file := root.ComputeAbsolutePath(layer)):
+            raise InputError(f"{path}: {file} is missing; a run over a shot and the shot have to move together")
 
 
 def progress(stage: Usd.Stage) -> tuple[int, int] | None:
     """Return how many frames of how many a stage has whose run has not finished; None for all others."""
-    found = _note(stage, "progress")
+    found = _note(stage.GetRootLayer(), "progress")
     return (found["frames"], found["of"]) if found else None
 
 
@@ -130,7 +143,7 @@ def set_progress(layer: Sdf.Layer, frames: int, of: int) -> None:
 
 def overridden(stage: Usd.Stage) -> list[Sdf.Path]:
     """Return the meshes of a shot that a run has written over; none in all other stages."""
-    return [Sdf.Path(path) for path in _note(stage, "over") or ()]
+    return [Sdf.Path(path) for path in _note(stage.GetRootLayer(), "over") or ()]
 
 
 def set_clips(prim: Usd.Prim, clips: Sequence[tuple[float, str]], last: float) -> None:

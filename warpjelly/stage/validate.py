@@ -79,13 +79,9 @@ def _files(stage: Usd.Stage) -> Iterator[str]:
 
 
 def _layers(stage: Usd.Stage) -> Iterator[str]:
-    """Check the files of a run over a shot, and that the shot is there."""
-    root = stage.GetRootLayer()
-    folder = Path(root.realPath).parent
+    """Check the files of a run over a shot, but not those of the shot."""
+    folder = Path(stage.GetRootLayer().realPath).parent
     yield from _sound_files(layer for layer in stage.GetUsedLayers() if folder in Path(layer.realPath).parents)
-    for path in root.subLayerPaths:
-        if not Sdf.Layer.FindOrOpen(root.ComputeAbsolutePath(path)):
-            yield f"{root.GetDisplayName()}: {path} is missing"
 
 
 def _sound_files(layers: Iterable[Sdf.Layer]) -> Iterator[str]:
