@@ -111,7 +111,7 @@ def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             named = {str(entry.get("name", number)): entry for number, entry in enumerate(value)}
             yield from _flattened(named, f"{prefix}{key}.")
-        elif key in ("file", "grid"):
+        elif key in ("file", "grid", "over"):
             for name, content in _contents(Path(value)):
                 yield f"{prefix}{key}{name}", content
         else:

@@ -27,7 +27,7 @@ from ..errors import InputError
 from ..looks import Texture
 from ..polygons import triangulate
 from .legends import legend_of
-from .solids import colors_at, diffuse, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
+from .solids import colors_at, diffuse, looks_of, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
 
 # More than that, no browser holds.
 MAX_BYTES = 1_000_000_000
@@ -117,7 +117,7 @@ def _surfaces(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
         triangles, faces = triangulate(np.array(points.Get(frame)).reshape(-1, 3)[chosen], counts, corners)
         subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
         own = subset_of_faces(subsets, len(counts))
-        colors = [*(_plain_color(subset.GetPrim(), images) for subset in subsets), None]
+        colors = [*(_plain_color(prim, images) for prim in looks_of(mesh, subsets)), None]
         order = np.argsort(own[faces], kind="stable")
         numbers, sizes = np.unique(own[faces], return_counts=True)
         parts = [

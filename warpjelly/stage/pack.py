@@ -72,13 +72,13 @@ def pack(source: Path, output: Path) -> None:
 
 
 def join_clips(
-    rest: Sdf.Layer, clips: Sequence[tuple[int, Path]], force_range: tuple[float, float], output: Path
+    rest: Sdf.Layer, clips: Sequence[tuple[float, Path]], force_range: tuple[float, float], output: Path
 ) -> None:
     """Write a stage in parts as one crate file, clip after clip.
 
     Args:
         rest: all but the samples; what it declares is what is taken of the clips.
-        clips: first frame and file of each, in order.
+        clips: first time code and file of each, in order.
         force_range: forces at both ends of the colours, N, where the clips still have the forces; other colours stay.
         output: the file to make, .usdc; it appears under its name only when it is complete.
 
@@ -101,7 +101,7 @@ def join_clips(
 
 
 def _add_clip(joined: Sdf.Layer, clip: Sdf.Layer, start: float, end: float, force_range: tuple[float, float]) -> None:
-    """Add the samples of a clip from a frame to one before another to a layer with a file, and save it."""
+    """Add the samples of a clip from a time code to before another to a layer with a file, and save it."""
     waiting = 0
     for time, attribute in _samples(clip):
         if not start <= time < end or not joined.GetAttributeAtPath(attribute):
