@@ -51,7 +51,7 @@ def make_shot(path: Path, *, moving: bool = False, mirrored: bool = False, left_
     UsdGeom.Xform.Define(stage, "/set/rig/inner").AddTranslateOp().Set(Gf.Vec3d(1, 2, 30))
     looks = [_look(stage, name, color) for name, color in (("red", (1, 0, 0)), ("blue", (0, 0, 1)))]
 
-    hard = _box(stage, HARD, FACES[:, ::-1] if left_handed else FACES, (8, 6, 30))
+    hard = box(stage, HARD, FACES[:, ::-1] if left_handed else FACES, (8, 6, 30))
     hard.CreateSubdivisionSchemeAttr("none")
     normals = OUTWARD.reshape(6, 4, 3)[:, ::-1].reshape(-1, 3) if left_handed else OUTWARD
     primvar = UsdGeom.PrimvarsAPI(hard).CreatePrimvar("normals", Sdf.ValueTypeNames.Normal3fArray, "faceVarying")
@@ -65,11 +65,11 @@ def make_shot(path: Path, *, moving: bool = False, mirrored: bool = False, left_
     subset = UsdShade.MaterialBindingAPI(hard).CreateMaterialBindSubset("top", [1])
     UsdShade.MaterialBindingAPI.Apply(subset.GetPrim()).Bind(looks[1])
 
-    smooth = _box(stage, SMOOTH, FACES, (6, 6, 24), lone=True)
+    smooth = box(stage, SMOOTH, FACES, (6, 6, 24), lone=True)
     smooth.CreateNormalsAttr([(0, 0, 1)] * 9)
     UsdShade.MaterialBindingAPI.Apply(smooth.GetPrim()).Bind(looks[1])
 
-    other = _box(stage, "/set/other", FACES, (1, 1, 1))
+    other = box(stage, "/set/other", FACES, (1, 1, 1))
     other.GetPointsAttr().Set(other.GetPointsAttr().Get(), 1003)
     camera = UsdGeom.Camera.Define(stage, "/set/camera")
     camera.AddTranslateOp().Set(Gf.Vec3d(40, -300, 135))
@@ -80,7 +80,7 @@ def make_shot(path: Path, *, moving: bool = False, mirrored: bool = False, left_
     return path
 
 
-def _box(stage: Usd.Stage, path: str, faces: np.ndarray, size: Any, *, lone: bool = False) -> UsdGeom.Mesh:
+def box(stage: Usd.Stage, path: str, faces: np.ndarray, size: Any, *, lone: bool = False) -> UsdGeom.Mesh:
     """Define a box; with ``lone``, it has one point more, which belongs to no face."""
     mesh = UsdGeom.Mesh.Define(stage, path)
     points = np.concatenate([CORNERS * size, [[0.0, 0.0, 0.0]] if lone else np.zeros((0, 3))])

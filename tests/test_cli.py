@@ -549,6 +549,14 @@ def test_a_model_without_voxels_names_a_resolution_that_has_some(warpjelly, tmp_
     assert warpjelly("voxelize", tmp_path / "flat.obj", "-n", 4, "--keep-thin-parts")[0] == 0
 
 
+def test_check_says_where_in_a_shot_a_run_goes(warpjelly):
+    """Print the meshes and the time codes of a run over a shot."""
+    code, out, _ = warpjelly("check", SCENES / "dessert_shot.toml")
+    assert code == 0
+    assert "over       /shot/dessert/jelly, /shot/dessert/cherry\n" in out
+    assert "1001 to 1036, its time codes\n" in out
+
+
 def test_check_names_the_memory_of_the_largest_bodies(warpjelly, tmp_path):
     """Share the estimate of memory among bodies, the largest first."""
     code, out, _ = warpjelly("check", SCENES / "pile.toml", "--json")

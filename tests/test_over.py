@@ -15,7 +15,24 @@ import numpy as np
 import pytest
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
 from runs import samples_of
-from shots import DRIFT, END, FPS, FRAMES, HARD, OUTWARD, RATE, SMOOTH, START, UNIT, make_shot, shot_scene, shot_tables
+from shots import (
+    CORNERS,
+    DRIFT,
+    END,
+    FACES,
+    FPS,
+    FRAMES,
+    HARD,
+    OUTWARD,
+    RATE,
+    SMOOTH,
+    START,
+    UNIT,
+    box,
+    make_shot,
+    shot_scene,
+    shot_tables,
+)
 
 from warpjelly import plan
 from warpjelly.errors import InputError
@@ -45,10 +62,10 @@ simulate(shot_scene(Path(sys.argv[1]), solver__dt=1e-4), output=sys.argv[2], dev
 """
 
 
-def fallen(frame: int, substeps: int) -> np.ndarray:
+def fallen(frame: int, substeps: int, fps: float = FPS) -> np.ndarray:
     """Return how far a body fell that nothing touches, m: semi-implicit Euler sums g dt^2 (1 + 2 + ... + n)."""
     steps = frame * substeps
-    return GRAVITY * (1 / (FPS * substeps)) ** 2 * steps * (steps + 1) / 2
+    return GRAVITY * (1 / (fps * substeps)) ** 2 * steps * (steps + 1) / 2
 
 
 def world_of(stage: Usd.Stage, path: str, time: float) -> np.ndarray:
@@ -338,6 +355,27 @@ def test_a_shot_is_not_replaced(tmp_path, options):
         simulate(shot_scene(shot), output=tmp_path, device="cpu", **options)
     assert shot.read_bytes() == content
     assert os.listdir(tmp_path) == ["stage.usda"]
+
+
+def test_a_bare_shot_will_do(tmp_path):
+    """Take what a shot leaves out as USD does: centimetres, y up, 24 time codes a second from 0; miss a camera."""
+    stage = Usd.Stage.CreateNew(str(tmp_path / "bare.usda"))
+    box(stage, "/box", FACES, (50, 50, 50))
+    stage.GetRootLayer().Save()
+    scene = shot_scene(tmp_path / "bare.usda", up_axis="Y", bodies__0__prim="/box", frames=6, fps=24.0, **SLOW)
+    simulate(scene, output=tmp_path / "run", device="cpu")
+    points = [(y, code) for (path, code), y in samples_of(tmp_path / "run").items() if path == "/box.points"]
+    assert [code for _, code in points] == [0, 1, 2, 3, 4, 5]
+    moved = np.frombuffer(points[-1][0], np.float32).reshape(-1, 3) - CORNERS * 50
+    drop = fallen(5, scene.substeps_for(1e-4), fps=24.0)[2] / 0.01
+    np.testing.assert_allclose(moved, [[0, drop, 0]] * 8, atol=2e-5)
+    assert stage_problems(tmp_path / "run") == []
+    with pytest.raises(InputError, match="the stage has no camera"):
+        render_preview(tmp_path / "run", tmp_path / "page.html")
+    stage = Usd.Stage.Open(str(tmp_path / "bare.usda"))
+    UsdGeom.Camera.Define(stage, "/camera").AddTranslateOp().Set(Gf.Vec3d(0, 0, 300))
+    stage.GetRootLayer().Save()
+    render_preview(tmp_path / "run", tmp_path / "page.html")
 
 
 def test_check_says_where_it_will_be(tmp_path, caplog):

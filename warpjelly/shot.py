@@ -110,7 +110,7 @@ class Shot:
     def _obstacle(self, path: str, frame_count: int) -> str | None:
         mesh = self.mesh(path)
         if mesh.GetPrim().IsInstanceProxy():
-            return "is part of an instance, whose meshes are shared: set instanceable = false on the instance, or in it"
+            return "is part of an instance, whose meshes are shared: set instanceable = false on the instance first"
         if _is_skinned(mesh.GetPrim()):
             return "is deformed by a skeleton, which would deform the result again: bake it into points first"
         for attribute in (mesh.GetFaceVertexCountsAttr(), mesh.GetFaceVertexIndicesAttr()):

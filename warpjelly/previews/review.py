@@ -96,8 +96,9 @@ def review_page(
         "legend": _legend(stage),
         "shapes": described,
     }
+    default = stage.GetDefaultPrim()
     values = {
-        "TITLE": html.escape(Usd.ModelAPI(stage.GetDefaultPrim()).GetAssetName() or "stage"),
+        "TITLE": html.escape((Usd.ModelAPI(default).GetAssetName() if default else "") or "stage"),
         # A script ends at the first "</", even in a string.
         "STAGE": json.dumps(description).replace("</", "<\\/"),
         "ARRAYS": base64.b64encode(zlib.compress(b"".join(arrays), 9)).decode(),

@@ -170,8 +170,12 @@ class Over:
                 layer.pseudoRoot.SetInfo(key, shot.GetInfo(key))
         # Of a run that this one goes over.
         remove_notes(layer)
-        # A sublayer and its root have the same time only where both say so.
-        layer.timeCodesPerSecond = self._shot.stage.GetTimeCodesPerSecond()
+        # What the shot leaves to defaults is said: a sublayer and its root have the same time only where both say so.
+        stage = Usd.Stage.Open(layer)
+        UsdGeom.SetStageMetersPerUnit(stage, self._shot.unit)
+        UsdGeom.SetStageUpAxis(stage, self._scene.up_axis)
+        stage.SetTimeCodesPerSecond(self._shot.stage.GetTimeCodesPerSecond())
+        stage.SetFramesPerSecond(self._shot.stage.GetFramesPerSecond())
         set_note(layer, "over", Vt.StringArray([str(path) for path in self.clip_prims]))
 
     def define_rest(

@@ -123,8 +123,11 @@ def _usd_validators(stage: Usd.Stage) -> Iterator[str]:
 def _own_problems(stage: Usd.Stage) -> Iterator[str]:
     """Return what USD says of a run over a shot, but not of the shot alone."""
     root = stage.GetRootLayer()
-    shot = Sdf.Layer.FindOrOpen(root.ComputeAbsolutePath(root.subLayerPaths[-1])) if root.subLayerPaths else None
-    known = set(_usd_validators(Usd.Stage.Open(shot))) if shot else set()
+    known = set()
+    for path in root.subLayerPaths[-1:]:
+        shot = Sdf.Layer.FindOrOpen(root.ComputeAbsolutePath(path))
+        # Some of the problems name the stage.
+        known = {problem.replace(shot.identifier, root.identifier) for problem in _usd_validators(Usd.Stage.Open(shot))}
     yield from (problem for problem in _usd_validators(stage) if problem not in known)
 
 
