@@ -5,6 +5,7 @@ All of them take full steps of semi-implicit Euler with gravity, and no contact.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -96,6 +97,8 @@ class Contender:
     package: ClassVar[str]
     stride: ClassVar[int] = 1
     """Numbers of steps are multiples of it."""
+    most_springs: ClassVar[float] = math.inf
+    """Larger things are not for this one."""
 
     def __init__(self, thing: Thing, scene: Scene) -> None:
         raise NotImplementedError
@@ -164,6 +167,8 @@ class NewtonGraph(Newton):
 
     label = "Newton, as a graph"
     stride = 2
+    # Beyond, Python costs nothing beside the steps, but a second model much memory.
+    most_springs = 1e6
 
     def __init__(self, thing: Thing, scene: Scene) -> None:
         import warp as wp

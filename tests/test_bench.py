@@ -85,8 +85,7 @@ def test_twins_move_the_same_particles():
     stretched = np.ascontiguousarray(1.01 * alone.positions.T)
     for each in (sim, alone):
         each.state.x.assign(stretched)
-    twin = bench.twin(sim, cubes.scene(**rk4))
-    twin.step(25)
+    bench.twin(sim, cubes.scene(**rk4))(25)
     alone.step(25)
     np.testing.assert_array_equal(sim.positions, alone.positions)
 
