@@ -6,6 +6,8 @@ All of them take full steps of semi-implicit Euler with gravity, and no contact.
 from __future__ import annotations
 
 import math
+import sys
+from contextlib import redirect_stdout
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar
@@ -194,10 +196,12 @@ class Taichi(Contender):
     label, package = "Taichi, atomic scatter", "taichi"
 
     def __init__(self, thing: Thing, scene: Scene) -> None:
-        import scattering
-        import taichi
+        # It introduces itself on stdout.
+        with redirect_stdout(sys.stderr):
+            import scattering
+            import taichi
 
-        taichi.init(arch=taichi.cpu, log_level=taichi.ERROR)
+            taichi.init(arch=taichi.cpu, log_level=taichi.ERROR)
         self.x, self.v, self.f = np.array(thing.x), np.array(thing.v), np.zeros_like(thing.x)
         self.springs = [np.array(rows) for rows in (thing.first, thing.second, thing.kind, thing.classes)]
         self.constants = np.array(thing.mass), np.array(thing.gravity)[None], float(thing.dt)

@@ -33,6 +33,7 @@ from contenders import CONTENDERS, Contender, Newton, NumPy, Taichi, Thing, Warp
 from warpjelly import bench
 from warpjelly.simulator import Simulator
 
+RATIO = "warpjelly is so many times as fast"
 INSTALL = "pip install 'warpjelly[bench]'"
 # How long each contender steps in a round, s.
 SLICE = 0.3
@@ -175,19 +176,17 @@ def print_race(results: dict[str, dict[str, Any]], labels: Sequence[str]) -> Non
     """Print a table for each figure, with a row for each contender."""
     forms: list[tuple[str, Callable[[dict[str, Any]], str]]] = [
         ("million springs/s", lambda f: f"{statistics.median(f['springs_per_second']) / 1e6:.3g}"),
+        (RATIO, lambda f: spread(f["ratio"])),
         ("million springs/s per core used", lambda f: f"{statistics.median(per_core(f)) / 1e6:.3g}"),
-        ("warpjelly is so many times as fast (least to most)", lambda f: spread(f["ratio"])),
-        ("substeps/s", lambda f: f"{1.0 / statistics.median(f['seconds_per_substep']):.4g}"),
         ("cores used", lambda f: f"{statistics.median(f['cores_used']):.1f}"),
+        ("substeps/s", lambda f: f"{1.0 / statistics.median(f['seconds_per_substep']):.4g}"),
         ("bytes per particle", lambda f: f"{f['bytes_per_particle']:.0f}"),
         ("first frame after, s", lambda f: f"{f['first_frame_seconds']:.1f}"),
     ]
     for title, form in forms:
-        rows = [
-            [label, *(form(result[label]) if label in result else "–" for result in results.values())]
-            for label in labels
-        ]
-        print_table(title, [["", *results], *rows])
+        shown = [label for label in labels if title != RATIO or label != Warpjelly.label]
+        cells = [[form(result[label]) if label in result else "–" for result in results.values()] for label in shown]
+        print_table(title, [["", *results], *([label, *row] for label, row in zip(shown, cells, strict=True))])
 
 
 def per_core(figures: dict[str, Any]) -> list[float]:

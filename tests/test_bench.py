@@ -233,8 +233,9 @@ def test_peers_compute_the_same(thing, tmp_path, kind):
         peers.check_positions([kind], thing, tmp_path)
 
 
-def test_race_times_every_contender_in_every_round():
+def test_race_times_every_contender_in_every_round(monkeypatch):
     """Give a figure per round for each, and ratios of the same round."""
+    monkeypatch.setattr(peers, "SLICE", 0.02)
     kinds = [contenders.Warpjelly, contenders.NumPy]
     result = peers.race("cube_8", kinds, 2)
     own, numpy = (result[kind.label] for kind in kinds)
