@@ -204,7 +204,7 @@ def print_targets(results: dict[str, dict[str, Any]], report: dict[str, Any]) ->
     scenes = report["scenes"]
     if (scene := scenes.get("cubes_100")) is not None:
         label = "100 cubes at once, times as fast as one after another, per core used"
-        rows.append([label, f"{scene['at_once_ratio'] / scene['cores_used']:.2f}", "at least 1.7"])
+        rows.append([label, f"{scene['at_once_core_ratio']:.2f}", "at least 1.7"])
     if (scene := scenes.get("cube_64")) is not None:
         rows.append(["cube_64, a step of RK4, in steps", f"{scene['rk4_ratio']:.2f}", "at most 4.3"])
         rows.append(

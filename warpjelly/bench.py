@@ -130,7 +130,9 @@ class Figures:
     pair_share: float | None
     """Share of a step that contact between bodies takes where each touches its neighbours; None with one body."""
     at_once_ratio: float | None
-    """Time that the bodies take as scenes of their own, stepped in turn, over that of one scene; None with one body."""
+    """Time that the bodies take as scenes one after another, over that of one scene; None with one body."""
+    at_once_core_ratio: float | None
+    """The same of processor time: how much more each core does that is used."""
     first_frame_seconds: float
     """From the start of a Python process to the end of the first frame, of 10 steps."""
     bytes_per_particle: float
@@ -218,6 +220,10 @@ def measure(cubes: Cubes, device: str, rounds: int, began: float) -> Figures:
     def ratio(above: str, below: str) -> float:
         return statistics.median(a.seconds / b.seconds for a, b in zip(times[above], times[below], strict=True))
 
+    def core_ratio(above: str, below: str) -> float:
+        turns = zip(times[above], times[below], strict=True)
+        return statistics.median(a.seconds * a.cores / (b.seconds * b.cores) for a, b in turns)
+
     model = free.model
     seconds = statistics.median(slice_.seconds for slice_ in times["free"])
     rates = [model.spring_count / slice_.seconds for slice_ in times["free"]]
@@ -237,6 +243,7 @@ def measure(cubes: Cubes, device: str, rounds: int, began: float) -> Figures:
         contact_share=1.0 - ratio("standing", "ground"),
         pair_share=1.0 - ratio("beside", "touching") if "touching" in times else None,
         at_once_ratio=ratio("singles", "free") if "singles" in times else None,
+        at_once_core_ratio=core_ratio("singles", "free") if "singles" in times else None,
         first_frame_seconds=first_frame,
         bytes_per_particle=held_bytes(ground) / model.particle_count,
     )
@@ -397,6 +404,9 @@ def table(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
     def share(value: float | None) -> str:
         return "–" if value is None else f"{value:.0%}"
 
+    def times(value: float | None) -> str:
+        return "–" if value is None else f"{value:.2f}"
+
     return [
         ("", *report["scenes"]),
         row("particles", lambda s: f"{s['particles']:,}"),
@@ -414,7 +424,8 @@ def table(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
         row("  gravity, integration", lambda s: share(s["integration_share"])),
         row("  contact, on the floor", lambda s: share(s["contact_share"])),
         row("  contact between bodies", lambda s: share(s["pair_share"])),
-        row("one after another, at once", lambda s: f"{s['at_once_ratio']:.2f}" if s["at_once_ratio"] else "–"),
+        row("one after another, in times at once", lambda s: times(s["at_once_ratio"])),
+        row("  per core used", lambda s: times(s["at_once_core_ratio"])),
         row("first frame after", lambda s: f"{s['first_frame_seconds']:.2f} s"),
         row("bytes per particle", lambda s: f"{s['bytes_per_particle']:.0f}"),
     ]
