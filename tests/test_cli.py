@@ -790,7 +790,7 @@ def test_help_teaches_every_command(warpjelly):
     """Show help for the program and each command, and the version."""
     code, out, _ = warpjelly("--help")
     assert code == 0
-    for command in ("run", "check", "validate", "preview", "doctor"):
+    for command in ("run", "check", "validate", "preview", "bench", "doctor"):
         assert command in out
         assert warpjelly(command, "--help")[0] == 0
     assert warpjelly("--version")[1].startswith("warpjelly ")

@@ -75,7 +75,7 @@ def test_wheel_holds_the_packages(site: Path) -> None:
     """Install both packages, their data and the licence, and nothing at the top level besides."""
     folders = {path.name for path in site.iterdir()}
     assert folders == {"warpjelly", "bin", f"warpjelly-{PYPROJECT['project']['version']}.dist-info"}
-    assert all((site / "warpjelly" / name).is_file() for name in ("py.typed", "previews/review.html"))
+    assert all((site / "warpjelly" / name).is_file() for name in ("py.typed", "baseline.json", "previews/review.html"))
     assert list(site.glob("*.dist-info/licenses/LICENSE"))
     for package, folder in (("warpjelly", "warpjelly"), ("warpjelly/kernels", "kernels")):
         installed = {path.name for path in (site / package).glob("*.py")}

@@ -388,6 +388,81 @@ def export_world(
 
 
 @app.command()
+def bench(
+    scenes: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="SCENE",
+            help="cube_8, cube_32, cube_64, cube_128 (particles along an edge), cubes_100 (a hundred of cube_8); all "
+            "but cube_128 unless given.",
+            show_default=False,
+        ),
+    ] = None,
+    device: DeviceOption = "auto",
+    rounds: Annotated[int, typer.Option(min=1, help="How often each figure is measured; more are steadier.")] = 15,
+    baseline: Annotated[
+        Path | None,
+        typer.Option(
+            help="Report of an earlier run to compare with; warpjelly's own unless given.", show_default=False
+        ),
+    ] = None,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Report to write, .json, a baseline for later runs.", show_default=False),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure the speed of this machine on standard scenes, in less than a minute.
+
+    Figures are medians over rounds in which everything has its turn; other work on the machine widens their range.
+
+    The reference kernel is the plainest that computes the forces of springs, one after another on the CPU. Measured in
+    the same rounds, it tells a slower program from a slower machine: a scene whose ratio to it is a quarter below the
+    baseline's is warned of, and the exit code stays 0.
+
+    To see what a change does to speed here: bench -o before.json, change, bench --baseline before.json.
+    """
+    from .bench import BASELINE, QUICK, SCENES, run, table
+    from .files import refuse_to_replace, whole_file
+
+    names = list(dict.fromkeys(scenes or QUICK))
+    if unknown := [name for name in names if name not in SCENES]:
+        raise InputError(f"{unknown[0]}: no standard scene; they are {', '.join(SCENES)}")
+    if output is not None:
+        refuse_to_replace(output, force=force)
+    with _progress("measuring") as show:
+        report = run(names, device=device, rounds=rounds, baseline=baseline or BASELINE, progress=show)
+    if output is not None:
+        with whole_file(output) as file:
+            file.write_text(json.dumps(report, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    if as_json:
+        print(json.dumps(report, allow_nan=False))
+        return
+
+    from rich.box import SIMPLE
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    (corner, *names), *rows = table(report)
+    shown = Table(corner, *(Column(name, justify="right", no_wrap=True) for name in names), box=SIMPLE)
+    for row in rows:
+        shown.add_row(*row)
+    versions = f"warpjelly {report['warpjelly']}, Warp {report['warp-lang']}, Python {report['python']}"
+    print(f"{report['device_name']}, {report['cores']} cores; {versions}")
+    # As wide as the table is, wherever it goes.
+    Console(width=200, highlight=False).print(shown)
+    then = report["baseline"]
+    print(
+        f"baseline: {then['device_name']}, {then['cores']} cores"
+        if then is not None
+        else f"baseline: not of {report['device']}, not compared"
+    )
+    if output is not None:
+        print(f"report: {output}")
+
+
+@app.command()
 def doctor() -> None:
     """Show versions, devices, and which optional parts are present."""
     import platform
@@ -413,6 +488,7 @@ def doctor() -> None:
     for extra, modules in [
         ("preview", ["pyvista", "PIL", "imageio_ffmpeg", "matplotlib"]),
         ("formats", ["lxml", "networkx", "collada"]),
+        ("bench", ["newton", "numba", "taichi"]),
     ]:
         missing = "" if all(map(util.find_spec, modules)) else f"missing: pip install 'warpjelly[{extra}]'"
         print(f"  {extra:<10} {missing or 'present'}")
