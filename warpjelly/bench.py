@@ -9,7 +9,6 @@ import gc
 import json
 import logging
 import math
-import os
 import platform
 import statistics
 import time
@@ -32,6 +31,8 @@ from .errors import InputError
 from .files import missing
 from .scene import Scene
 from .simulator import Simulator
+from .stepping import Stepper
+from .team import available_cores
 
 log = logging.getLogger("warpjelly")
 
@@ -254,10 +255,22 @@ def twin(sim: Simulator, scene: Scene) -> Callable[[int], None]:
 
     Where arrays lie in memory changes speed by up to a fifth, which is more than what is measured.
     """
-    other = Simulator(scene, device=sim.device)
-    other.model = replace(sim.model, colliders=other.model.colliders, skin=other.model.skin)
-    other.state = sim.state
-    return other.step
+    contact = Simulator(scene, device=sim.device).model
+    stepper = Stepper(
+        replace(sim.model, colliders=contact.colliders, skin=contact.skin),
+        sim.state,
+        integrator=scene.solver.integrator,
+        dt=sim.dt,
+        culling=scene.solver.culling,
+        threads=available_cores(),
+    )
+
+    def step(count: int) -> None:
+        frames, rest = divmod(count, STEPS_PER_FRAME)
+        for steps in [STEPS_PER_FRAME] * frames + [1] * rest:
+            stepper.step(steps)
+
+    return step
 
 
 @dataclass(frozen=True)
@@ -340,11 +353,6 @@ def held_bytes(root: object) -> int:
     return size
 
 
-def cores() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def processor() -> str:
     """Return the name of the processor."""
     lines = Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").is_file() else []
@@ -357,7 +365,7 @@ def machine(device: str) -> dict[str, Any]:
     return {
         "device": device,
         "device_name": processor() if device == "cpu" else wp.get_device(device).name,
-        "cores": cores(),
+        "cores": available_cores(),
         "python": platform.python_version(),
         **{package: metadata.version(package) for package in ("warpjelly", "warp-lang", "numpy")},
     }
