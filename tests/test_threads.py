@@ -80,7 +80,8 @@ def test_threads_do_not_change_a_bit(integrator: str, soft: bool, precision: str
     runs = []
     for threads in (1, 2, 3, 7):
         simulator = Simulator(scene, device="cpu", threads=threads)
-        assert simulator.threads == threads
+        # Where bodies may touch, more than four are not worth it.
+        assert simulator.threads == (min(threads, 4) if soft else threads)
         # Frames of five substeps, and single ones.
         for count in (20, 11) if threads < 3 else (31,):
             simulator.step(count)

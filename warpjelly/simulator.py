@@ -72,14 +72,15 @@ class Simulator:
             self._normals = wp.zeros(int(self._normal_start[-1]), dtype=wp.vec3f)
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
-        self._stepper = Stepper(
-            self.model,
-            self.state,
-            integrator=self.scene.solver.integrator,
-            dt=self.dt,
-            culling=self.scene.solver.culling,
-            threads=available_cores() if threads is None else threads,
-        )
+        with capture_lock:
+            self._stepper = Stepper(
+                self.model,
+                self.state,
+                integrator=self.scene.solver.integrator,
+                dt=self.dt,
+                culling=self.scene.solver.culling,
+                threads=available_cores() if threads is None else threads,
+            )
 
     @property
     def threads(self) -> int:

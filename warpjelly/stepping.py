@@ -22,6 +22,8 @@ log = logging.getLogger("warpjelly")
 MAX_CAPTURED_SUBSTEPS = 64
 # Launches of an evaluation of the forces and of the stage that follows it, but for those of the springs.
 MAX_LAUNCHES = 10
+# Most threads where bodies may touch: each needs a graph of its own, and the search for contact runs in one of them.
+MAX_SOFT_THREADS = 4
 # Warp cannot capture in two threads at once, nor allocate in one while it captures in another.
 capture_lock = threading.Lock()
 
@@ -98,6 +100,8 @@ class Stepper:
         self.capturable = self.soft is None or self._device.is_cpu
         """Whether steps are replayed as captured graphs."""
         most = self._parts.most_tasks if self._device.is_cpu else 1
+        if self.soft is not None:
+            most = min(most, MAX_SOFT_THREADS)
         launches = MAX_CAPTURED_SUBSTEPS * max(1, len(self._stages)) * (MAX_LAUNCHES + len(self._parts.phases))
         self._team = Team(min(threads, most), launches) if most > 1 else None
         # The thread whose graph is being captured.
