@@ -54,6 +54,8 @@ DIRECTIONS += DIRECTIONS[:3]
 KINDS = np.repeat([STRUCTURAL, FACE_SHEAR, BODY_SHEAR, BEND], [3, 6, 4, 3])
 # Vertices are numbered in int32.
 MAX_VERTICES = 2**31 - 1
+# Spans that are taken apart at a time, where few of their springs are looked for.
+_SPAN_BLOCK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,8 @@ class SpringClasses:
 class Lattice:
     """One body at rest, in its own frame; in a network or a cloth, which have no cells, a particle counts as of one."""
 
-    particles: np.ndarray
-    """Rest positions, float64 [particle_count, 3], m."""
+    places: np.ndarray
+    """Where the particles rest, [particle_count, 3]: of cells, the vertices of the grid, int32; else float64, m."""
     spans: np.ndarray
     """Springs (i, j), (i + 1, j + 1), ... of one class as (i, j, count, class), by ascending i, at most MAX_SPAN each,
     int32 [span_count, 4]."""
@@ -99,9 +101,28 @@ class Lattice:
     """Lowest corner of the grid, float64 [3], m."""
 
     @property
+    def particle_count(self) -> int:
+        """Number of particles."""
+        return len(self.places)
+
+    @property
     def spring_count(self) -> int:
         """Number of springs."""
         return int(self.spans[:, 2].sum(dtype=np.int64))
+
+    @property
+    def particles(self) -> np.ndarray:
+        """Rest positions of all particles, float64 [particle_count, 3], m; of a large body, more than all the rest."""
+        return self.positions(slice(None))
+
+    def positions(self, particles: slice | np.ndarray) -> np.ndarray:
+        """Return the rest positions of some particles, float64 [..., 3], m."""
+        x = self.places[particles].astype(float)
+        if self.grid is not None:
+            # In place: at this size each temporary counts.
+            x *= self.unit
+            x += self.origin
+        return x
 
     def grid_coordinates(self, points: np.ndarray) -> np.ndarray:
         """Return points in the frame of the body, [..., 3], m, in unit cells from the origin of its grid."""
@@ -112,11 +133,25 @@ class Lattice:
 
         It takes some ten times the memory of the lattice itself.
         """
-        counts = self.spans[:, 2]
-        place = np.arange(self.spring_count) - np.repeat(np.cumsum(counts, dtype=np.int64) - counts, counts)
-        ends = np.repeat(self.spans[:, :2], counts, axis=0)
-        ends += place[:, None].astype(np.int32)
-        return ends, np.repeat(self.spans[:, 3], counts)
+        return _springs_of(self.spans)
+
+    def springs_among(self, chosen: np.ndarray) -> np.ndarray:
+        """Return both ends of each spring between chosen particles, bool [particle_count]: int32 [count, 2]."""
+        found = [np.zeros((0, 2), np.int32)]
+        for start in range(0, len(self.spans), _SPAN_BLOCK):
+            ends, _ = _springs_of(self.spans[start : start + _SPAN_BLOCK])
+            found.append(ends[chosen[ends].all(axis=1)])
+        return np.concatenate(found)
+
+
+def _springs_of(spans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Take spans apart: both ends of each spring, int32 [spring_count, 2], and its class, int32 [spring_count]."""
+    counts = spans[:, 2]
+    first = np.cumsum(counts, dtype=np.int64) - counts
+    place = np.arange(counts.sum(dtype=np.int64)) - np.repeat(first, counts)
+    ends = np.repeat(spans[:, :2], counts, axis=0)
+    ends += place[:, None].astype(np.int32)
+    return ends, np.repeat(spans[:, 3], counts)
 
 
 def build_lattice(
@@ -148,14 +183,10 @@ def build_lattice(
     vertices = wp.empty(particle_count, dtype=wp.vec3i, device="cpu")
     cell_counts = wp.zeros((grid.material_count, particle_count), dtype=wp.uint8, device="cpu")
     _launch(place_particles, len(grid.run_row), [grid], [vertices, cell_counts])
-    particles = vertices.numpy().astype(float)
-    # In place: at this size each temporary counts.
-    particles *= unit
-    particles += origin
     spans, classes = _connect(grid, unit, weighted)
     surface_particles, surface_quads = _skin(grid, particle_count)
     return Lattice(
-        particles=particles,
+        places=vertices.numpy(),
         spans=spans,
         classes=classes,
         cell_counts=cell_counts.numpy(),

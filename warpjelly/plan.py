@@ -430,7 +430,7 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, Lattice, dict[str, Any]]:
         lattice,
         {
             "voxels": grid.cells.count,
-            "particles": len(lattice.particles),
+            "particles": lattice.particle_count,
             "springs": lattice.spring_count,
             "pieces": len(grid.piece_sizes),
             "watertight": voxelized.watertight,

@@ -140,7 +140,7 @@ def evaluations(model: Model) -> int:
 
 def _ratios(model: Model) -> np.ndarray:
     """Return damping / stiffness of each class of springs that does anything, [count], s."""
-    used = np.unique(model.spans.numpy()[:, 3])
+    used = np.bincount(model.spans.numpy()[:, 3], minlength=len(model.spring_classes)) > 0
     k, d = model.spring_classes.numpy().astype(float)[used, 1:].T
     acting = (k > 0.0) | (d > 0.0)
     return _quotient(d[acting], k[acting])
@@ -199,6 +199,8 @@ def magnetic_limits(model: Model, duration: float) -> dict[str, float]:
     starts, factors = table.curve_start.numpy(), np.abs(table.curve_factor.numpy())
     peak = [factors[i:j].max() if j > i else 1.0 for i, j in itertools.pairwise(starts)]
     field = float((strength * peak)[table.kind.numpy() == fields.MAGNETIC].sum())
+    if not field:
+        return dict.fromkeys(INTEGRATORS, MAX_STEP)
     rates = np.abs(model.particle_charge.numpy().astype(float)) * model.particle_inv_mass.numpy()
     if not (w := field * float(rates.max())):
         return dict.fromkeys(INTEGRATORS, MAX_STEP)
