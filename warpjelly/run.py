@@ -54,6 +54,9 @@ LIMIT_SHARE = 0.02
 LIMIT_SPRINGS = 100_000_000
 # A run warns of a body that is deeper than this in a collider at the end, in unit cells.
 DEEP_END = 1.0
+# A state of up to so many bytes is copied for its checkpoint, which is written beside the simulation; with a larger one
+# the simulation waits.
+COPIED_BYTES = 200e6
 # How long a forecast measures, s.
 FORECAST_SECONDS = 0.3
 
@@ -251,9 +254,14 @@ def _simulate_frames(
                 observer.observe(figures["penetrations"])
                 stopping = interrupted()
                 due = stopping or index + 1 == total or (index + 1 - first) % writer.clip_length == 0
-                changing = _changing_arrays(sim, observer) if due else None
+                # One checkpoint at a time: each may have a copy of the state.
+                if due:
+                    background.join()
+                changing, copied = _changing_arrays(sim, observer) if due else (None, True)
                 row = _metrics_row(index, sim.time, figures)
                 background.submit(recorder.save, index, sim.shapes(), row, changing)
+                if not copied:
+                    background.join()
                 progress(index + 1, total)
                 if stopping and index + 1 < total:
                     return stepping, KeyboardInterrupt()
@@ -265,10 +273,12 @@ def _simulate_frames(
     return stepping, None
 
 
-def _changing_arrays(sim: Simulator, observer: Observer) -> dict[str, np.ndarray]:
-    """Return copies of all that a checkpoint needs besides the stage."""
+def _changing_arrays(sim: Simulator, observer: Observer) -> tuple[dict[str, np.ndarray], bool]:
+    """Return all that a checkpoint needs besides the stage, and whether it is copied: otherwise it changes."""
     parts = {"state": state_arrays(sim), "observer": observer.arrays()}
-    return {f"{owner}.{name}": array for owner, arrays in parts.items() for name, array in arrays.items()}
+    arrays = {f"{owner}.{name}": array for owner, group in parts.items() for name, array in group.items()}
+    copied = sum(array.nbytes for array in arrays.values()) <= COPIED_BYTES
+    return {name: array.copy() for name, array in arrays.items()} if copied else arrays, copied
 
 
 @contextmanager
