@@ -381,7 +381,7 @@ def doctor() -> None:
     import warp as wp
 
     from .device import start_warp
-    from .plan import memory_limit
+    from .memory import memory_limit
 
     start_warp()
     print(f"warpjelly {metadata.version('warpjelly')} on Python {platform.python_version()}, {platform.platform()}")

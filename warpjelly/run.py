@@ -24,6 +24,7 @@ from .checkpoint import Checkpoint, differences, origin_of, restore_state, scene
 from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
 from .expect import Observer, Outcome
 from .files import locked
+from .memory import COPIED_BYTES, seeks_limits
 from .plan import plan_scene
 from .rundir import (
     CHECKPOINT_NAME,
@@ -48,15 +49,8 @@ log = logging.getLogger("warpjelly")
 
 # Frames that were simulated and are not written yet: while one is written, the next but one may be simulated.
 FRAMES_IN_FLIGHT = 2
-# A run warns of a step above the limit where finding the limit takes at most this share of it, or at most as long as
-# evaluating the forces of so many springs once each, a second or less.
-LIMIT_SHARE = 0.02
-LIMIT_SPRINGS = 100_000_000
 # A run warns of a body that is deeper than this in a collider at the end, in unit cells.
 DEEP_END = 1.0
-# A state of up to so many bytes is copied for its checkpoint, which is written beside the simulation; with a larger one
-# the simulation waits.
-COPIED_BYTES = 200e6
 # How long a forecast measures, s.
 FORECAST_SECONDS = 0.3
 
@@ -382,10 +376,8 @@ def _metrics_row(index: int, seconds: float, figures: Mapping[str, Any]) -> dict
 
 
 def _warn_of_long_steps(sim: Simulator) -> None:
-    effort = evaluations(sim.model)
-    if effort * sim.model.spring_count > LIMIT_SPRINGS and effort > LIMIT_SHARE * sim.substeps * sim.scene.frame_count:
-        return
-    if broken := sim.broken_limit():
+    steps = sim.substeps * sim.scene.frame_count
+    if seeks_limits(sim.model.spring_count, steps, evaluations(sim.model)) and (broken := sim.broken_limit()):
         log.warning("%s", broken)
 
 

@@ -20,6 +20,7 @@ import warp as wp
 
 from warpjelly.kernels import contacts, fields
 
+from .memory import LIMIT_EVALUATIONS
 from .model import Model, launch_spring_forces
 from .placing import BLOCK
 
@@ -136,12 +137,15 @@ def bound_spring_pairs(model: Model, x: wp.array) -> np.ndarray:
 
 def evaluations(model: Model) -> int:
     """Return how many evaluations of the spring forces take about as long as ``bound_spring_pairs``."""
-    return 60 if _are_equal(_ratios(model)) else 1200
+    return LIMIT_EVALUATIONS if _are_equal(_ratios(model)) else 20 * LIMIT_EVALUATIONS
 
 
 def _ratios(model: Model) -> np.ndarray:
     """Return damping / stiffness of each class of springs that does anything, [count], s."""
-    used = np.bincount(model.spans.numpy()[:, 3], minlength=len(model.spring_classes)) > 0
+    # Not all spans at once, as numbers that index take eight bytes.
+    used, labels = np.zeros(len(model.spring_classes), bool), model.spans.numpy()[:, 3]
+    for start in range(0, len(labels), BLOCK):
+        used[labels[start : start + BLOCK]] = True
     k, d = model.spring_classes.numpy().astype(float)[used, 1:].T
     acting = (k > 0.0) | (d > 0.0)
     return _quotient(d[acting], k[acting])
