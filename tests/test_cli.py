@@ -15,11 +15,14 @@ import pytest
 import trimesh
 from pxr import Usd, UsdGeom
 from world_files import WORLDS
+from worlds import FEWER_VOXELS, LARGER
 
 import warpjelly as wj
 from warpjelly import cli, plan
 from warpjelly.meshes import EXTENSIONS, EXTRA_EXTENSIONS, load_mesh
+from warpjelly.run import forecast
 from warpjelly.scene import Scene
+from warpjelly.scenefile import load_scene
 from warpjelly.stage.stagefiles import open_stage
 from warpjelly.stage.validate import stage_problems
 
@@ -109,13 +112,27 @@ def test_run_and_the_python_interface_agree(warpjelly, tmp_path):
 
 def test_the_stage_of_every_scene_is_sound(warpjelly, tmp_path):
     """Run each scene for a moment and validate its stage."""
-    for path in sorted(SCENES.glob("*.toml")):
+    for path in sorted(path for path in SCENES.glob("*.toml") if path.stem not in LARGER):
         # One of them is there to diverge, after 31 frames; its stage has the frames before.
         frames, expected = (60, 3) if path.stem == "broken_damping" else (4, 0)
-        assert warpjelly("run", path, "--frames", frames, "-o", tmp_path / path.stem)[0] == expected
+        fewer = [f"--set={key}={value}" for key, value in FEWER_VOXELS.get(path.stem, {}).items()]
+        assert warpjelly("run", path, "--frames", frames, "-o", tmp_path / path.stem, *fewer)[0] == expected
         code, out, err = warpjelly("validate", tmp_path / path.stem)
         assert (code, err) == (0, "")
         assert out.endswith("sound\n")
+
+
+def test_steps_that_take_long_are_named():
+    """Hear what a check is doing, so that a terminal can show it."""
+    heard = []
+    with cli._steps(heard.append):
+        forecast(load_scene(SCENES / "tree_drop.toml"))
+    assert heard == [
+        "voxelising tree.obj at resolution 12",
+        "building 'tree' of 485 particles",
+        "finding the largest stable step",
+        "measuring how long a frame takes",
+    ]
 
 
 def test_validate_lists_every_problem_and_exits_with_1(warpjelly, tmp_path):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -28,6 +29,8 @@ from .scene import (
     SphereCollider,
 )
 from .shapes import Shape, shapes_of, starts_of
+
+steps = logging.getLogger("warpjelly.steps")
 
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
@@ -136,6 +139,7 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     first = class_count = 0
     for body_plan in plan.bodies:
         body, materials = body_plan.body, [scene.materials[name] for name in body_plan.materials]
+        steps.info("building '%s' of %s particles", body.name, f"{body_plan.particle_count:,}")
         lattice = body_plan.build()
         own = slice(first, first + lattice.particle_count)
         bodies.append(Body(name=str(body.name), particles=own, unit=lattice.unit))

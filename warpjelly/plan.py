@@ -53,6 +53,8 @@ if TYPE_CHECKING:
     from .voxelize import VoxelGrid
 
 log = logging.getLogger("warpjelly")
+# What takes long on a large model says so here.
+steps = logging.getLogger("warpjelly.steps")
 
 # With law "young" springs near the surface differ, so there are so many spans more per face of a jelly cube.
 YOUNG_SPANS = 2
@@ -324,6 +326,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
             BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * count,
             f"bodies.{body.name}: about {count:,.0f} voxels at resolution {body.resolution:,}",
         )
+    steps.info("voxelising %s at resolution %s", body.file.name, f"{body.resolution:,}")
     grid, notes = voxelize_mesh(
         mesh, body.resolution, method=body.method, keep_thin_parts=body.keep_thin_parts, pieces=body.pieces
     )

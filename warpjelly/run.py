@@ -46,6 +46,7 @@ from .stage.stagewriter import StageWriter
 from .starts import warn_of_deep_starts
 
 log = logging.getLogger("warpjelly")
+steps = logging.getLogger("warpjelly.steps")
 
 # Frames that were simulated and are not written yet: while one is written, the next but one may be simulated.
 FRAMES_IN_FLIGHT = 2
@@ -116,7 +117,9 @@ def simulate(
                 checkpoint = None
             if not (force or resume):
                 refuse_to_replace_run(folder)
+            began = time.perf_counter()
             sim = Simulator(plan_scene(scene), device=device)
+            build_seconds = time.perf_counter() - began
             warn_of_deep_starts(sim)
             _warn_of_long_steps(sim)
             if not existed:
@@ -124,7 +127,7 @@ def simulate(
                 held.enter_context(locked(folder))
                 # Another process may have come first.
                 refuse_to_replace_run(folder)
-            return _simulate_into(folder, sim, checkpoint, progress)
+            return _simulate_into(folder, sim, build_seconds, checkpoint, progress)
     except OSError as error:
         raise EnvironmentFailedError(f"{folder}: cannot write the run: {error.strerror or error}") from error
 
@@ -145,7 +148,11 @@ def _finished_run(folder: Path, scene: Scene) -> Run | None:
 
 
 def _simulate_into(
-    folder: Path, sim: Simulator, checkpoint: Checkpoint | None, progress: Callable[[int, int], None]
+    folder: Path,
+    sim: Simulator,
+    build_seconds: float,
+    checkpoint: Checkpoint | None,
+    progress: Callable[[int, int], None],
 ) -> Run:
     """Simulate the frames that a run directory lacks."""
     scene, rest = sim.scene, sim.shapes()
@@ -206,6 +213,7 @@ def _simulate_into(
         "substeps": sim.substeps,
         "dt": sim.dt,
         "precision": scene.solver.precision,
+        "build_seconds": build_seconds,
         "wall_seconds": time.perf_counter() - began,
         "springs_per_second": sim.model.spring_count * forces / stepping if forces else 0.0,
         "diverged": isinstance(ended, DivergedError),
@@ -317,6 +325,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
     warn_of_deep_starts(sim)
     if broken := sim.broken_limit():
         log.warning("%s", broken)
+    steps.info("measuring how long a frame takes")
     sim.step()
     sim.shapes()
     sim.diagnostics()

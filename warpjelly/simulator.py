@@ -33,6 +33,7 @@ from .stability import (
 )
 
 log = logging.getLogger("warpjelly")
+steps = logging.getLogger("warpjelly.steps")
 
 # A captured graph holds at most this many substeps; longer frames replay it. Capturing costs as much as ten replays.
 MAX_CAPTURED_SUBSTEPS = 64
@@ -193,6 +194,7 @@ class Simulator:
         if self._limits is None:
             if self.substep_count > 0:
                 raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
+            steps.info("finding the largest stable step")
             pairs = bound_spring_pairs(self.model, self.state.x)
             self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self._contact_pairs))
         return self._limits[contacts]
