@@ -6,6 +6,7 @@ import hashlib
 import json
 import platform
 import zipfile
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from importlib import metadata
@@ -17,6 +18,7 @@ import numpy as np
 from .errors import InputError
 from .files import whole_file
 from .model import State
+from .readers.companions import files_of
 from .scene import Scene
 from .simulator import Simulator
 
@@ -109,11 +111,24 @@ def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             named = {str(entry.get("name", number)): entry for number, entry in enumerate(value)}
             yield from _flattened(named, f"{prefix}{key}.")
-        elif key == "file":
-            digest = hashlib.sha256(Path(value).read_bytes()).hexdigest()
-            yield f"{prefix}{key}", f"{Path(value).name} (SHA-256 {digest[:16]})"
+        elif key in ("file", "grid", "over"):
+            for name, content in _contents(Path(value)):
+                yield f"{prefix}{key}{name}", content
         else:
             yield f"{prefix}{key}", value
+
+
+def _contents(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield (key, content) of a file, whose key is empty, and of files that it names, whose keys are their names."""
+    folder, digests = path.parent.resolve(), defaultdict[str, list[str]](list)
+    for file in files_of(path):
+        # Where a model has moved with all that is beside it, nothing has changed.
+        place = file.parent.resolve() / file.name
+        name = place.relative_to(folder).as_posix() if place.is_relative_to(folder) else file.name
+        with open(file, "rb") as content:
+            digests[name].append(hashlib.file_digest(content, "sha256").hexdigest()[:16])
+    for name, found in digests.items():
+        yield "" if name == path.name else f" {name}", f"{name} (SHA-256 {', '.join(found)})"
 
 
 def origin_of(device: str) -> dict[str, str]:

@@ -18,9 +18,12 @@ if TYPE_CHECKING:
 MAX_ROW_BYTES = 2**31 - 1
 BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 
-# The program and its packages; reading a model needs more of them.
-BYTES_AT_REST = 311e6
-BYTES_OF_MODELS = 30e6
+# Pages of libraries that the process maps: how many of them count as its memory, the kernel decides.
+BYTES_OF_LIBRARIES = 222e6
+# What the program and its packages take themselves; reading a model needs more of them.
+BYTES_AT_REST = 94e6
+PROGRAM_BYTES = BYTES_OF_LIBRARIES + BYTES_AT_REST
+BYTES_OF_MODELS = 23e6
 # Numbers that stay of each particle, in the precision of the scene: three each of x, v, f and x_start, mass and inverse
 # mass; for the stages of Runge-Kutta schemes v_start and two sums.
 NUMBERS, STAGE_NUMBERS = 14, 9
@@ -78,7 +81,7 @@ def peak_bytes(bodies: Sequence[BodyPlan], scene: Scene, samples: int) -> int:
     stays = sum(body_bytes(body, scene, samples) for body in bodies)
     simulating = stays + _passing_bytes(bodies, scene)
     building = max(map(built_bytes, bodies))
-    rest = BYTES_AT_REST + BYTES_OF_MODELS * any(body.triangle_count for body in bodies)
+    rest = PROGRAM_BYTES + BYTES_OF_MODELS * any(body.triangle_count for body in bodies)
     return int(rest + max(simulating, building))
 
 
