@@ -18,8 +18,8 @@ from warpjelly.errors import SceneError
 from warpjelly.plan import plan_scene
 from warpjelly.scene import Scene
 
-# Runs a scene and prints what was planned, the greatest memory of the process, and what of it are pages of mapped files.
-# How many of these there are is up to the kernel, so they are left out of what is planned and measured. In bytes.
+# Runs a scene and prints what was planned, the greatest memory of the process, and its pages of mapped files, in bytes.
+# How many of these there are is up to the kernel, so they are left out of what is planned and measured.
 RUN = """
 import json, sys
 from pathlib import Path
