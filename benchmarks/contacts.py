@@ -8,7 +8,6 @@ speed of a cube of 32 particles per edge, whose rows are powers of two, by more 
 particles per edge with six objects is the case that the thesis "Gelatin Cubes" (USI 2023) measures.
 """
 
-import copy
 import dataclasses
 import statistics
 import time
@@ -16,7 +15,7 @@ from typing import Any
 
 from warpjelly.scene import Scene
 from warpjelly.simulator import Simulator
-from warpjelly.softcontact import SoftContact
+from warpjelly.stepping import MAX_CAPTURED_SUBSTEPS, Stepper
 
 ROUNDS = 75
 # How long each variant steps in a round, s.
@@ -47,39 +46,34 @@ def make_simulator(particles_per_edge: int, *places: list[float], **parts: Any) 
         "bodies": [{**cube, "name": f"cube_{i}", "position": place} for i, place in enumerate(places)],
         **parts,
     }
-    return Simulator(Scene.model_validate(scene), device="cpu")
+    return Simulator(Scene.model_validate(scene), device="cpu", threads=1)
 
 
-def variants_of(culled: Simulator) -> list[Simulator]:
-    """Return a simulator without contact, as it is, and without culling."""
-    free, full = copy.copy(culled), copy.copy(culled)
+def variants_of(simulator: Simulator) -> list[Stepper]:
+    """Return steppers of one state: without contact, with culling, and without culling."""
     nothing = make_simulator(2, [0.0, 0.0, 0.0]).model.colliders
-    free.model = dataclasses.replace(culled.model, colliders=nothing, skin=None)
-    solver = culled.scene.solver.model_copy(update={"culling": False})
-    full.scene = culled.scene.model_copy(update={"solver": solver})
-    if culled._soft is not None:
-        free._soft = None
-        full._soft = SoftContact(full.model, full.state, culling=False)
-    for variant in (free, full):
-        variant._graphs = {}
-    return [free, culled, full]
+    free = dataclasses.replace(simulator.model, colliders=nothing, skin=None)
+    return [
+        Stepper(model, simulator.state, integrator="semi_implicit_euler", dt=simulator.dt, culling=culling, threads=1)
+        for model, culling in ((free, True), (simulator.model, True), (simulator.model, False))
+    ]
 
 
-def seconds_per_substep(simulator: Simulator, count: int) -> float:
+def seconds_per_substep(stepper: Stepper, count: int) -> float:
     """Time some substeps."""
     began = time.perf_counter()
-    simulator.step(count)
+    stepper.step(count)
     return (time.perf_counter() - began) / count
 
 
-def measure(culled: Simulator) -> tuple[float, float, float]:
+def measure(simulator: Simulator) -> tuple[float, float, float]:
     """Return what contact costs with culling and without, as shares, and a substep without contact, s."""
-    variants = variants_of(culled)
-    for simulator in variants:
-        simulator.prepare()
-        simulator.step()
-    count = max(1, round(SLICE / seconds_per_substep(variants[0], 3)))
-    rounds = [[seconds_per_substep(simulator, count) for simulator in variants] for _ in range(ROUNDS)]
+    steppers = variants_of(simulator)
+    seconds_per_substep(steppers[0], 3)
+    count = min(max(1, round(SLICE / seconds_per_substep(steppers[0], 3))), MAX_CAPTURED_SUBSTEPS)
+    for stepper in steppers:
+        stepper.step(count)
+    rounds = [[seconds_per_substep(stepper, count) for stepper in steppers] for _ in range(ROUNDS)]
     culling, full = (statistics.median(times[i] / times[0] for times in rounds) - 1.0 for i in (1, 2))
     return culling, full, statistics.median(times[0] for times in rounds)
 

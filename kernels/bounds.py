@@ -7,7 +7,7 @@ from typing import Any
 
 import warp as wp
 
-from . import vectors
+from . import turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,28 +18,29 @@ MARGIN = 1e-5
 
 # Each row in a loop that the compiler for CPUs turns into vector instructions: least and greatest of every 32nd number
 # first. A comparison with what is not a number is false and changes nothing.
-@wp.func_native("""
+@wp.func_native(f"""
+    {vectors.ROW}
     typedef decltype(infinity) real;
-    for (int row = 0; row < 3; ++row) {
-        const real* __restrict p = x.data + row * x.shape[1];
+    for (int axis = 0; axis < 3; ++axis) {{
+        const real* __restrict p = row(x, axis);
         real low[32], high[32];
-        for (int k = 0; k < 32; ++k) { low[k] = infinity; high[k] = -infinity; }
+        for (int k = 0; k < 32; ++k) {{ low[k] = infinity; high[k] = -infinity; }}
         int i = begin;
-        for (; i + 32 <= end; i += 32) for (int k = 0; k < 32; ++k) {
+        for (; i + 32 <= end; i += 32) for (int k = 0; k < 32; ++k) {{
             low[k] = p[i + k] < low[k] ? p[i + k] : low[k];
             high[k] = p[i + k] > high[k] ? p[i + k] : high[k];
-        }
-        for (int k = 0; i < end; ++i, ++k) {
+        }}
+        for (int k = 0; i < end; ++i, ++k) {{
             low[k] = p[i] < low[k] ? p[i] : low[k];
             high[k] = p[i] > high[k] ? p[i] : high[k];
-        }
-        for (int half = 16; half > 0; half /= 2) for (int k = 0; k < half; ++k) {
+        }}
+        for (int half = 16; half > 0; half /= 2) for (int k = 0; k < half; ++k) {{
             low[k] = low[k + half] < low[k] ? low[k + half] : low[k];
             high[k] = high[k + half] > high[k] ? high[k + half] : high[k];
-        }
-        lower.data[row * lower.shape[1] + box] = low[0];
-        upper.data[row * upper.shape[1] + box] = high[0];
-    }
+        }}
+        row(lower, axis)[box] = low[0];
+        row(upper, axis)[box] = high[0];
+    }}
 """)
 def _store_box(
     x: wp.array2d(dtype=Any),
@@ -54,6 +55,9 @@ def _store_box(
 
 @wp.kernel
 def update_chunk_bounds(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
     # Model:
     chunk_start: wp.array(dtype=wp.int32),
     # State in:
@@ -62,10 +66,14 @@ def update_chunk_bounds(
     lower: wp.array2d(dtype=Any),
     upper: wp.array2d(dtype=Any),
 ):
-    """Overwrite the box [3, chunk_count] of each chunk, one thread per chunk."""
-    chunk = wp.tid()
-    infinity = type(x[0, 0])(wp.inf)
-    _store_box(x, chunk_start[chunk], chunk_start[chunk + 1], infinity, lower, upper, chunk)
+    """Overwrite the box [3, chunk_count] of each chunk, launched over parts, each some chunks from part_start on."""
+    part = wp.tid()
+    mine = turns.take(turn, part)
+    if mine:
+        infinity = type(x[0, 0])(wp.inf)
+        for chunk in range(part_start[part], part_start[part + 1]):
+            _store_box(x, chunk_start[chunk], chunk_start[chunk + 1], infinity, lower, upper, chunk)
+    turns.leave(turn, part, mine)
 
 
 @wp.kernel

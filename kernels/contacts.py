@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from . import bounds, vectors
+from . import bounds, turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -21,6 +21,8 @@ SPHERE = wp.constant(2)
 # Slower than this [m/s] along a surface, a particle rests, and static friction may hold it. It is far below what
 # gravity gives in a millisecond, and far above what rounding leaves of a particle that was stopped.
 REST_SPEED = 1e-4
+# Particles that are looked at together, in one vector instruction, before each of them is.
+GROUP = 8
 # Lanes per chunk where a launch runs in parallel; where it runs one thread after another, one lane is best.
 PARALLEL_LANES = 32
 
@@ -90,6 +92,18 @@ def entry_normal(radius: Any, before: Any, local: Any):
     c = wp.dot(before, before) - radius * radius
     s = (-half_b - wp.sqrt(wp.max(type(radius)(0.0), half_b * half_b - a * c))) / a
     return wp.normalize(before + s * path)
+
+
+@wp.func
+def is_within(colliders: Any, c: int, body: int, point: Any):
+    """Say whether a point is within the surface of collider c, without which there is no contact."""
+    local = point - colliders.center[c]
+    within = bool(False)
+    if colliders.kind[c] == SPHERE:
+        within = wp.length(local) <= colliders.size[c][0]
+    else:
+        within = wp.dot(local, colliders.side[c, body] * colliders.normal[c]) <= type(point[0])(0.0)
+    return within
 
 
 @wp.func
@@ -216,6 +230,84 @@ def may_touch(colliders: Any, c: int, body: int, lower: Any, upper: Any):
 
 
 @wp.func
+def collider_bit(c: int):
+    """Return the bit of a collider in a mask; those beyond the width of the mask share the last one."""
+    return wp.uint32(1) << wp.uint32(wp.min(c, 31))
+
+
+_ANY_WITHIN = f"""
+    {vectors.ROW}
+    auto px = row(x, 0), py = row(x, 1), pz = row(x, 2);
+    auto cx = center[0], cy = center[1], cz = center[2], nx = normal[0], ny = normal[1], nz = normal[2], most = limit;
+    int within = 0;
+    for (int i = begin; i < end; ++i) {{
+        auto dx = px[i] - cx, dy = py[i] - cy, dz = pz[i] - cz;
+        auto height = dx * nx + dy * ny + dz * nz, square = dx * dx + dy * dy + dz * dz;
+        within |= radial ? square <= most * most : height <= most;
+    }}
+    return within != 0;
+"""
+
+
+# What returns a value cannot be both native and generic, so there is one for each precision.
+@wp.func_native(_ANY_WITHIN)
+def any_within(
+    x: wp.array2d(dtype=wp.float32),
+    begin: int,
+    end: int,
+    center: wp.vec3f,
+    normal: wp.vec3f,
+    limit: float,
+    radial: bool,
+) -> bool:
+    """Say whether any of some particles is within a distance of a centre, or no higher than that along a normal."""
+    ...
+
+
+@wp.func_native(_ANY_WITHIN)
+def any_within(  # noqa: F811
+    x: wp.array2d(dtype=wp.float64),
+    begin: int,
+    end: int,
+    center: wp.vec3d,
+    normal: wp.vec3d,
+    limit: wp.float64,
+    radial: bool,
+) -> bool:
+    """Do the same in float64."""
+    ...
+
+
+@wp.func
+def group_may_touch(
+    colliders: Any, near: wp.uint32, body: int, x: wp.array2d(dtype=Any), begin: int, end: int, reach: Any
+):
+    """Say whether any of some particles may be in contact with a collider of a mask; never wrongly no.
+
+    Args:
+        colliders: table of colliders.
+        near: mask of those to look at.
+        body: body of the particles.
+        x: positions.
+        begin: first of the particles.
+        end: end of them.
+        reach: no less than the distance of any of them from the origin, m.
+    """
+    found = bool(False)
+    for c in range(colliders.kind.shape[0]):
+        if near & collider_bit(c) != wp.uint32(0):
+            center = colliders.center[c]
+            radial = colliders.kind[c] == SPHERE
+            # As for boxes, far above rounding errors.
+            limit = type(reach)(bounds.MARGIN) * (type(reach)(1.0) + wp.length(center) + reach)
+            if radial:
+                limit += colliders.size[c][0]
+            if any_within(x, begin, end, center, colliders.side[c, body] * colliders.normal[c], limit, radial):
+                found = True
+    return found
+
+
+@wp.func
 def held_contact(colliders: Any, c: int, stamps: wp.array2d(dtype=wp.int32), i: int, step: wp.int64):
     """Say whether particle i was in contact with collider c one step earlier, or has been in this step already."""
     held = bool(False)
@@ -256,13 +348,21 @@ def remember_contact(
 
 
 @wp.func
-def collider_bit(c: int):
-    """Return the bit of a collider in a mask; those beyond the width of the mask share the last one."""
-    return wp.uint32(1) << wp.uint32(wp.min(c, 31))
+def near_colliders(colliders: Any, body: int, lower: Any, upper: Any, culling: bool):
+    """Return a mask of the colliders that a box of particles may touch; of all without culling."""
+    near = wp.uint32(0)
+    for c in range(colliders.kind.shape[0]):
+        if not culling or may_touch(colliders, c, body, lower, upper):
+            near |= collider_bit(c)
+    return near
 
 
 @wp.kernel
 def add_contact_forces(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     mass: wp.array(dtype=Any),
     inv_mass: wp.array(dtype=Any),
@@ -282,74 +382,87 @@ def add_contact_forces(
     ahead: Any,
     first: bool,
     culling: bool,
-    lanes: int,
     # State in and out:
     stamps: wp.array2d(dtype=wp.int32),
     normals: wp.array2d(dtype=Any),
     f: wp.array2d(dtype=Any),
     losses: wp.array2d(dtype=wp.float64),
 ):
-    """Add the contact forces, launched over (chunk, lane); lane k takes particles k, k + lanes, ... of the chunk.
+    """Add the contact forces, launched over (part, lane), where parts are chunks from part_start on.
 
-    The first evaluation of a step remembers contacts; those of later stages look at trial positions only. Losses
-    [2, chunk_count] gain what contact damping and friction take, at the velocities that the forces make some time
-    ahead, times loss_weight.
+    Lane k takes particles k, k + lanes, ... of each chunk. The first evaluation of a step remembers contacts; those of
+    later stages look at trial positions only. Losses [2, chunk_count] gain what contact damping and friction take, at
+    the velocities that the forces make some time ahead, times loss_weight.
     """
-    chunk, lane = wp.tid()
-    body = chunk_body[chunk]
-    low = vectors.load(lower, chunk)
-    high = vectors.load(upper, chunk)
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
     now = step[0]
     at_start = now == wp.int64(0)
     # In the first evaluation a contact of the step before still holds; later ones go by what the first one found.
     latest = now
     if not first:
         latest = now + wp.int64(1)
-    near = wp.uint32(0)
-    for c in range(colliders.kind.shape[0]):
-        if not culling or may_touch(colliders, c, body, low, high):
-            near |= collider_bit(c)
-    if near == wp.uint32(0):
-        return
-    damped = wp.float64(0.0)
-    rubbed = wp.float64(0.0)
-    for i in range(chunk_start[chunk] + lane, chunk_start[chunk + 1], lanes):
-        point = vectors.load(x, i)
-        start = vectors.load(x_start, i)
-        total = type(dt)(0.0) * point
-        damping = type(dt)(0.0) * point
-        rubbing = type(dt)(0.0) * point
-        touches = bool(False)
-        for c in range(colliders.kind.shape[0]):
-            if near & collider_bit(c) != wp.uint32(0):
-                held = held_contact(colliders, c, stamps, i, latest)
-                before = held_normal(colliders, c, normals, i)
-                normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, at_start)
-                if depth >= type(dt)(0.0):
-                    touches = True
-                    if first:
-                        remember_contact(colliders, c, i, now, normal, stamps, normals)
-                    velocity = vectors.load(v, i)
-                    speed = wp.dot(velocity, normal)
-                    # Without the other colliders' reactions, so that their order does not matter.
-                    applied = vectors.load(f, i)
-                    pressing = -wp.dot(applied, normal)
-                    reaction = normal_reaction(colliders, c, counted, speed, pressing)
-                    # With what others rub already, so that all together do no more than stop the particle.
-                    rubbed_along = rubbing - wp.dot(rubbing, normal) * normal
-                    along = velocity - speed * normal
-                    pull = applied + pressing * normal + rubbed_along
-                    friction = friction_force(colliders, c, reaction, pressing, along, pull, mass[i], dt)
-                    rubbing += friction
-                    total += reaction * normal + friction
-                    damping += (reaction - colliders.stiffness[c] * counted) * normal
-        # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
-        if touches:
-            force = vectors.load(f, i) + total
-            vectors.store(f, i, force)
-            # Colliders come last, so that this is the whole force.
-            velocity = vectors.load(v, i) + ahead * inv_mass[i] * force
-            damped -= wp.float64(wp.dot(damping, velocity))
-            rubbed -= wp.float64(wp.dot(rubbing, velocity))
-    wp.atomic_add(losses, 0, chunk, wp.float64(loss_weight) * damped)
-    wp.atomic_add(losses, 1, chunk, wp.float64(loss_weight) * rubbed)
+    begin = part_start[part]
+    end = part_start[part + 1]
+    if not mine:
+        end = begin
+    for chunk in range(begin, end):
+        body = chunk_body[chunk]
+        low = vectors.load(lower, chunk)
+        high = vectors.load(upper, chunk)
+        near = near_colliders(colliders, body, low, high, culling)
+        if near == wp.uint32(0):
+            continue
+        damped = wp.float64(0.0)
+        rubbed = wp.float64(0.0)
+        last = chunk_start[chunk + 1]
+        reach = wp.length(low) + wp.length(high)
+        for group in range(chunk_start[chunk], last, GROUP * lanes):
+            stop = wp.min(group + GROUP * lanes, last)
+            # Most groups in a chunk near a collider touch nothing. Lanes of a GPU each see that for themselves.
+            if culling and lanes == 1:
+                if not group_may_touch(colliders, near, body, x, group, stop, reach):
+                    continue
+            for i in range(group + lane, stop, lanes):
+                point = vectors.load(x, i)
+                total = type(dt)(0.0) * point
+                damping = type(dt)(0.0) * point
+                rubbing = type(dt)(0.0) * point
+                touches = bool(False)
+                for c in range(colliders.kind.shape[0]):
+                    # What is not within is looked at no further, which is most.
+                    if near & collider_bit(c) != wp.uint32(0) and is_within(colliders, c, body, point):
+                        start = vectors.load(x_start, i)
+                        held = held_contact(colliders, c, stamps, i, latest)
+                        before = held_normal(colliders, c, normals, i)
+                        normal, depth, counted = find_contact(colliders, c, body, start, point, held, before, at_start)
+                        if depth >= type(dt)(0.0):
+                            touches = True
+                            if first:
+                                remember_contact(colliders, c, i, now, normal, stamps, normals)
+                            velocity = vectors.load(v, i)
+                            speed = wp.dot(velocity, normal)
+                            # Without the other colliders' reactions, so that their order does not matter.
+                            applied = vectors.load(f, i)
+                            pressing = -wp.dot(applied, normal)
+                            reaction = normal_reaction(colliders, c, counted, speed, pressing)
+                            # With what others rub already, so that all together do no more than stop the particle.
+                            rubbed_along = rubbing - wp.dot(rubbing, normal) * normal
+                            along = velocity - speed * normal
+                            pull = applied + pressing * normal + rubbed_along
+                            friction = friction_force(colliders, c, reaction, pressing, along, pull, mass[i], dt)
+                            rubbing += friction
+                            total += reaction * normal + friction
+                            damping += (reaction - colliders.stiffness[c] * counted) * normal
+                # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
+                if touches:
+                    force = vectors.load(f, i) + total
+                    vectors.store(f, i, force)
+                    # Colliders come last, so that this is the whole force.
+                    velocity = vectors.load(v, i) + ahead * inv_mass[i] * force
+                    damped -= wp.float64(wp.dot(damping, velocity))
+                    rubbed -= wp.float64(wp.dot(rubbing, velocity))
+        wp.atomic_add(losses, 0, chunk, wp.float64(loss_weight) * damped)
+        wp.atomic_add(losses, 1, chunk, wp.float64(loss_weight) * rubbed)
+    turns.leave(turn, task, mine)

@@ -8,7 +8,7 @@ from typing import Any
 
 import warp as wp
 
-from . import vectors
+from . import turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -103,21 +103,61 @@ def field_force(fields: Any, m: int, point: Any, velocity: Any, charge: Any):
     return fields.strength[m]
 
 
+@wp.func_native(f"""
+    {vectors.ROW}
+    {vectors.EACH}
+    for (int axis = 0; axis < 3; ++axis) {{
+        auto weight = gravity.data[0][axis];
+        auto m = mass.data;
+        auto p = row(f, axis);
+        each(begin, end, [=](int i) {{ p[i] = m[i] * weight; }});
+    }}
+""")
+def _set_weights(
+    mass: wp.array(dtype=Any), gravity: wp.array(dtype=Any), f: wp.array2d(dtype=Any), begin: int, end: int, lanes: int
+): ...
+
+
 @wp.kernel
 def set_gravity_forces(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     mass: wp.array(dtype=Any),
     gravity: wp.array(dtype=Any),
     # State out:
     f: wp.array2d(dtype=Any),
 ):
-    """Overwrite the forces with the weight of each particle; gravity is one vector [m/s^2]."""
-    i = wp.tid()
-    vectors.store(f, i, mass[i] * gravity[0])
+    """Overwrite the forces with the weight of each particle; gravity is one vector [m/s^2].
+
+    Launched over (part, lane); lane k takes particles k, k + lanes, ... of the part.
+    """
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
+    if mine:
+        _set_weights(mass, gravity, f, part_start[part] + lane, part_start[part + 1], lanes)
+    turns.leave(turn, task, mine)
+
+
+@wp.func
+def total_force(fields: Any, time: wp.float64, point: Any, velocity: Any, charge: Any):
+    """Return the sum of the forces of all fields on a particle at a time [s]."""
+    total = type(charge)(0.0) * point
+    for m in range(fields.kind.shape[0]):
+        factor = type(charge)(curve_factor(fields, m, time))
+        total += factor * field_force(fields, m, point, velocity, charge)
+    return total
 
 
 @wp.kernel
 def add_field_forces(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     charge: wp.array(dtype=Any),
     fields: Any,
@@ -133,17 +173,18 @@ def add_field_forces(
     f: wp.array2d(dtype=Any),
     work: wp.array(dtype=wp.float64),
 ):
-    """Add the forces of all fields at the time step * dt + offset [s], launched over particles.
+    """Add the forces of all fields at the time step * dt + offset [s], launched over (part, lane) as above.
 
     Work [particle_count] gains their power times work_weight.
     """
-    i = wp.tid()
-    time = wp.float64(step[0]) * dt + offset
-    point = vectors.load(x, i)
-    velocity = vectors.load(v, i)
-    total = type(point[0])(0.0) * point
-    for m in range(fields.kind.shape[0]):
-        factor = type(point[0])(curve_factor(fields, m, time))
-        total += factor * field_force(fields, m, point, velocity, charge[i])
-    vectors.store(f, i, vectors.load(f, i) + total)
-    work[i] += work_weight * wp.float64(wp.dot(total, velocity))
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
+    if mine:
+        time = wp.float64(step[0]) * dt + offset
+        for i in range(part_start[part] + lane, part_start[part + 1], lanes):
+            velocity = vectors.load(v, i)
+            total = total_force(fields, time, vectors.load(x, i), velocity, charge[i])
+            vectors.store(f, i, vectors.load(f, i) + total)
+            work[i] += work_weight * wp.float64(wp.dot(total, velocity))
+    turns.leave(turn, task, mine)

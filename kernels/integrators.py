@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from . import vectors
+from . import turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -17,8 +17,43 @@ STAGES = {
 }
 
 
+# Both schemes go row by row: components are independent of each other.
+@wp.func_native(f"""
+    {vectors.ROW}
+    {vectors.EACH}
+    for (int axis = 0; axis < 3; ++axis) {{
+        auto step = dt;
+        auto inverse = inv_mass.data;
+        auto force = row(f, axis);
+        auto start = row(x_start, axis);
+        auto place = row(x, axis);
+        auto speed = row(v, axis);
+        each(begin, end, [=](int i) {{
+            start[i] = place[i];
+            speed[i] += step * inverse[i] * force[i];
+            place[i] += step * speed[i];
+        }});
+    }}
+""")
+def _advance(
+    inv_mass: wp.array(dtype=Any),
+    f: wp.array2d(dtype=Any),
+    dt: Any,
+    x_start: wp.array2d(dtype=Any),
+    x: wp.array2d(dtype=Any),
+    v: wp.array2d(dtype=Any),
+    begin: int,
+    end: int,
+    lanes: int,
+): ...
+
+
 @wp.kernel
 def semi_implicit_euler(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     inv_mass: wp.array(dtype=Any),
     # State in:
@@ -30,17 +65,88 @@ def semi_implicit_euler(
     x: wp.array2d(dtype=Any),
     v: wp.array2d(dtype=Any),
 ):
-    """Advance by dt: first the velocities by the forces, then the positions by the new velocities."""
-    i = wp.tid()
-    position = vectors.load(x, i)
-    velocity = vectors.load(v, i) + dt * inv_mass[i] * vectors.load(f, i)
-    vectors.store(x_start, i, position)
-    vectors.store(v, i, velocity)
-    vectors.store(x, i, position + dt * velocity)
+    """Advance by dt: first the velocities by the forces, then the positions by the new velocities.
+
+    Launched over (part, lane); lane k takes particles k, k + lanes, ... of the part.
+    """
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
+    if mine:
+        _advance(inv_mass, f, dt, x_start, x, v, part_start[part] + lane, part_start[part + 1], lanes)
+    turns.leave(turn, task, mine)
+
+
+# The lambda is compiled for each of the four cases, so that no case is looked at within a loop.
+@wp.func_native(f"""
+    {vectors.ROW}
+    {vectors.EACH}
+    struct yes {{ enum {{ value = 1 }}; }};
+    struct no {{ enum {{ value = 0 }}; }};
+    auto stage = [&](auto is_first, auto is_last) {{
+        for (int axis = 0; axis < 3; ++axis) {{
+            auto step = dt, share = weight, ahead = reach * dt;
+            auto inverse = inv_mass.data;
+            auto force = row(f, axis);
+            auto place = row(x, axis);
+            auto speed = row(v, axis);
+            auto place_start = row(x_start, axis);
+            auto speed_start = row(v_start, axis);
+            auto place_sum = row(x_sum, axis);
+            auto speed_sum = row(v_sum, axis);
+            each(begin, end, [=](int i) {{
+                auto x_rate = speed[i], v_rate = inverse[i] * force[i];
+                auto x_total = share * x_rate, v_total = share * v_rate;
+                if (decltype(is_first)::value) {{
+                    place_start[i] = place[i];
+                    speed_start[i] = speed[i];
+                }} else {{
+                    x_total += place_sum[i];
+                    v_total += speed_sum[i];
+                }}
+                if (decltype(is_last)::value) {{
+                    place[i] = place_start[i] + step * x_total;
+                    speed[i] = speed_start[i] + step * v_total;
+                }} else {{
+                    place_sum[i] = x_total;
+                    speed_sum[i] = v_total;
+                    place[i] = place_start[i] + ahead * x_rate;
+                    speed[i] = speed_start[i] + ahead * v_rate;
+                }}
+            }});
+        }}
+    }};
+    if (first && last) stage(yes(), yes());
+    else if (first) stage(yes(), no());
+    else if (last) stage(no(), yes());
+    else stage(no(), no());
+""")
+def _advance_stage(
+    inv_mass: wp.array(dtype=Any),
+    f: wp.array2d(dtype=Any),
+    dt: Any,
+    weight: Any,
+    reach: Any,
+    first: bool,
+    last: bool,
+    x_start: wp.array2d(dtype=Any),
+    v_start: wp.array2d(dtype=Any),
+    x_sum: wp.array2d(dtype=Any),
+    v_sum: wp.array2d(dtype=Any),
+    x: wp.array2d(dtype=Any),
+    v: wp.array2d(dtype=Any),
+    begin: int,
+    end: int,
+    lanes: int,
+): ...
 
 
 @wp.kernel
 def runge_kutta_stage(
+    # Threads:
+    turn: turns.Turn,
+    part_start: wp.array(dtype=wp.int32),
+    lanes: int,
     # Model:
     inv_mass: wp.array(dtype=Any),
     # State in:
@@ -62,33 +168,30 @@ def runge_kutta_stage(
     """Use the forces of one stage; x and v become the next stage's trial state, or after the last one the new state.
 
     The rates (v, f / m) of the stages are summed with their weights. The next trial state lies ``reach`` dt from the
-    start along this stage's rates.
+    start along this stage's rates. Launched over (part, lane), as above.
     """
-    i = wp.tid()
-    x_rate = vectors.load(v, i)
-    v_rate = inv_mass[i] * vectors.load(f, i)
-    x_total = weight * x_rate
-    v_total = weight * v_rate
-    if first:
-        vectors.store(x_start, i, vectors.load(x, i))
-        vectors.store(v_start, i, vectors.load(v, i))
-    else:
-        x_total += vectors.load(x_sum, i)
-        v_total += vectors.load(v_sum, i)
-    if last:
-        vectors.store(x, i, vectors.load(x_start, i) + dt * x_total)
-        vectors.store(v, i, vectors.load(v_start, i) + dt * v_total)
-    else:
-        vectors.store(x_sum, i, x_total)
-        vectors.store(v_sum, i, v_total)
-        vectors.store(x, i, vectors.load(x_start, i) + reach * dt * x_rate)
-        vectors.store(v, i, vectors.load(v_start, i) + reach * dt * v_rate)
+    part, lane = wp.tid()
+    task = part * lanes + lane
+    mine = turns.take(turn, task)
+    if mine:
+        begin = part_start[part] + lane
+        end = part_start[part + 1]
+        _advance_stage(
+            inv_mass, f, dt, weight, reach, first, last, x_start, v_start, x_sum, v_sum, x, v, begin, end, lanes
+        )
+    turns.leave(turn, task, mine)
 
 
 @wp.kernel
 def count_step(
+    # Threads:
+    turn: turns.Turn,
     # State in and out:
     step: wp.array(dtype=wp.int64),
 ):
-    """Count a finished step in step[0]; a launch of one thread, since captured launches freeze their scalars."""
-    step[wp.tid()] += wp.int64(1)
+    """Count a finished step in step[0]; a launch of one task, since captured launches freeze their scalars."""
+    task = wp.tid()
+    mine = turns.take(turn, task)
+    if mine:
+        step[task] += wp.int64(1)
+    turns.leave(turn, task, mine)

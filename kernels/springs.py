@@ -9,7 +9,7 @@ from typing import Any
 
 import warp as wp
 
-from . import vectors
+from . import turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -76,25 +76,21 @@ def add_spring_forces(
     wp.atomic_add(losses, index, wp.float64(loss_weight * damping_power(offset, velocity, c[2])))
 
 
-# The same law for a whole span on the CPU, in three passes that the compiler turns into vector instructions. It could
-# not do so in one pass, where the two ends may overlap. Within a pass no particle occurs twice, so plain adds do.
+# The same law for a whole span on the CPU, in three passes of vector instructions. One pass would not do, where the two
+# ends may overlap. Within a pass no particle occurs twice, so plain adds do.
 @wp.func_native(f"""
     auto law_rest = rest;
     typedef decltype(law_rest) real;
-    const real* __restrict px = x.data + i;
-    const real* __restrict py = px + x.shape[1];
-    const real* __restrict pz = py + x.shape[1];
-    const real* __restrict qx = x.data + j;
-    const real* __restrict qy = qx + x.shape[1];
-    const real* __restrict qz = qy + x.shape[1];
-    const real* __restrict pu = v.data + i;
-    const real* __restrict pv = pu + v.shape[1];
-    const real* __restrict pw = pv + v.shape[1];
-    const real* __restrict qu = v.data + j;
-    const real* __restrict qv = qu + v.shape[1];
-    const real* __restrict qw = qv + v.shape[1];
+    const int lanes = 1;
+    {vectors.ROW}
+    {vectors.EACH}
+    const real *px = row(x, 0) + i, *py = row(x, 1) + i, *pz = row(x, 2) + i;
+    const real *qx = row(x, 0) + j, *qy = row(x, 1) + j, *qz = row(x, 2) + j;
+    const real *pu = row(v, 0) + i, *pv = row(v, 1) + i, *pw = row(v, 2) + i;
+    const real *qu = row(v, 0) + j, *qv = row(v, 1) + j, *qw = row(v, 2) + j;
     real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}], power[{MAX_SPAN}];
-    for (int s = 0; s < count; ++s) {{
+    for (int k = 0; k < 8; ++k) power[((count - 1) & ~7) + k] = real(0);
+    each(0, count, [&](int s) {{
         real dx = qx[s] - px[s], dy = qy[s] - py[s], dz = qz[s] - pz[s];
         real du = qu[s] - pu[s], dv = qv[s] - pv[s], dw = qw[s] - pw[s];
         real square = dx * dx + dy * dy + dz * dz;
@@ -111,20 +107,16 @@ def add_spring_forces(
         gy[s] = scale * dy;
         gz[s] = scale * dz;
         power[s] = damping * approach * approach;
-    }}
-    real* __restrict fx = f.data + i;
-    real* __restrict fy = fx + f.shape[1];
-    real* __restrict fz = fy + f.shape[1];
-    for (int s = 0; s < count; ++s) {{ fx[s] += gx[s]; fy[s] += gy[s]; fz[s] += gz[s]; }}
+    }});
+    real *fx = row(f, 0) + i, *fy = row(f, 1) + i, *fz = row(f, 2) + i;
+    each(0, count, [&](int s) {{ fx[s] += gx[s]; fy[s] += gy[s]; fz[s] += gz[s]; }});
     fx += j - i;
     fy += j - i;
     fz += j - i;
-    for (int s = 0; s < count; ++s) {{ fx[s] -= gx[s]; fy[s] -= gy[s]; fz[s] -= gz[s]; }}
+    each(0, count, [&](int s) {{ fx[s] -= gx[s]; fy[s] -= gy[s]; fz[s] -= gz[s]; }});
     // Eight sums at once: a single one would wait for each addition in turn.
     real sums[8] = {{}};
-    int s = 0;
-    for (; s + 8 <= count; s += 8) for (int k = 0; k < 8; ++k) sums[k] += power[s + k];
-    for (int k = 0; s < count; ++s, ++k) sums[k] += power[s];
+    for (int s = 0; s < count; s += 8) for (int k = 0; k < 8; ++k) sums[k] += power[s + k];
     real total = ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]));
     losses.data[span] += double(loss_weight * total);
 """)
@@ -146,6 +138,9 @@ def _add_span(
 
 @wp.kernel
 def add_span_forces(
+    # Threads:
+    turn: turns.Turn,
+    tasks: wp.array(dtype=wp.vec2i),
     # Model:
     spans: wp.array(dtype=wp.vec4i),
     classes: wp.array(dtype=Any),
@@ -158,8 +153,15 @@ def add_span_forces(
     f: wp.array2d(dtype=Any),
     losses: wp.array(dtype=wp.float64),
 ):
-    """Add the forces of the springs, one thread per span; for the CPU, where spans run one after another."""
-    index = wp.tid()
-    span = spans[index]
-    c = classes[span[3]]
-    _add_span(x, v, f, losses, index, span[0], span[1], span[2], c[0], c[1], c[2], loss_weight)
+    """Add the forces of the springs of some tasks (first span, end), launched over tasks; for the CPU.
+
+    There the springs of a task run one after another, so that adds need not be atomic.
+    """
+    task = wp.tid()
+    mine = turns.take(turn, task)
+    if mine:
+        for index in range(tasks[task][0], tasks[task][1]):
+            span = spans[index]
+            c = classes[span[3]]
+            _add_span(x, v, f, losses, index, span[0], span[1], span[2], c[0], c[1], c[2], loss_weight)
+    turns.leave(turn, task, mine)

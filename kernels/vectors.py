@@ -4,6 +4,29 @@ from typing import Any
 
 import warp as wp
 
+# For native code: row(q, component) points to a row of an array, whose rows may have gaps between them.
+ROW = """
+    auto row = [](auto& q, int component) { return (decltype(q.data))((char*)q.data + component * q.strides[0]); };
+"""
+# For native code: each(begin, end, body) calls body(i) for i = begin, begin + lanes ... before end, in any order. Where
+# lanes is 1, as on a CPU, it does so in vector instructions: whole ones first, and the rest in one that is masked, if
+# the processor has such.
+EACH = """
+    auto each = [=](int begin, int end, auto body) {
+        if (lanes > 1) {
+            for (int i = begin; i < end; i += lanes) body(i);
+            return;
+        }
+        const int whole = begin + ((end - begin) & ~7);
+        #pragma clang loop vectorize(assume_safety) interleave_count(1)
+        for (int i = begin; i < whole; ++i) body(i);
+        #if defined(__AVX__) || defined(__ARM_FEATURE_SVE)
+        #pragma clang loop vectorize(assume_safety) vectorize_predicate(enable) interleave_count(1)
+        #endif
+        for (int i = whole; i < end; ++i) body(i);
+    };
+"""
+
 
 @wp.func
 def load(q: wp.array2d(dtype=Any), i: int):

@@ -9,6 +9,7 @@ import numpy as np
 import warp as wp
 
 from warpjelly.kernels import bounds, contacts
+from warpjelly.kernels.turns import Turn
 from warpjelly.simulator import Simulator
 
 
@@ -96,7 +97,9 @@ def push_fully(
     lower, upper = (wp.array(np.full((3, count), np.nan), dtype=real, device=device) for _ in range(2))
     begin = wp.array(size * np.arange(count + 1), dtype=wp.int32, device=device)
     body = wp.zeros(count, dtype=wp.int32, device=device)
-    wp.launch(bounds.update_chunk_bounds, dim=count, inputs=[begin, xs], outputs=[lower, upper], device=device)
+    chunks = wp.array(np.arange(count + 1), dtype=wp.int32, device=device)
+    inputs = [Turn(), chunks, begin, xs]
+    wp.launch(bounds.update_chunk_bounds, dim=count, inputs=inputs, outputs=[lower, upper], device=device)
     if box is not None:
         lower.fill_(box[0])
         upper.fill_(box[1])
@@ -109,10 +112,11 @@ def push_fully(
         contacts.add_contact_forces,
         dim=(count, lanes),
         inputs=[
+            *(Turn(), chunks, lanes),
             *(wp.full(len(x), each, dtype=real, device=device) for each in (mass, 1.0 / mass)),
             *(begin, body, model.colliders, lower, upper),
             *(x_start, xs, vs, wp.full(1, step, dtype=wp.int64, device=device)),
-            *(real(simulator.dt), real(1.0), real(0.0), first, culling, lanes),
+            *(real(simulator.dt), real(1.0), real(0.0), first, culling),
         ],
         outputs=[*memory, f, losses],
         device=device,

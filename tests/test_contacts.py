@@ -14,6 +14,7 @@ from reference import EPSILON, ROUND_OFF, World
 from worlds import make_material, make_scene, make_voxels, set_state
 
 from warpjelly.kernels import bounds
+from warpjelly.kernels.turns import Turn
 from warpjelly.model import PRECISIONS
 from warpjelly.scene import Scene
 from warpjelly.simulator import Simulator
@@ -359,8 +360,11 @@ def test_boxes_are_the_extremes_of_their_particles(precision: str, device: str) 
     x[:, start[-2] :] = np.nan
     real = PRECISIONS[precision]
     lower, upper = (wp.full((3, len(sizes)), np.nan, dtype=real, device=device) for _ in range(2))
-    inputs = [wp.array(start, dtype=wp.int32, device=device), wp.array(x, dtype=real, device=device)]
-    wp.launch(bounds.update_chunk_bounds, dim=len(sizes), inputs=inputs, outputs=[lower, upper], device=device)
+    # Parts of one, two and three chunks, and one with the rest.
+    parts, start = (wp.array(a, dtype=wp.int32, device=device) for a in ([0, 1, 3, 6, len(sizes)], start))
+    inputs = [Turn(), parts, start, wp.array(x, dtype=real, device=device)]
+    wp.launch(bounds.update_chunk_bounds, dim=4, inputs=inputs, outputs=[lower, upper], device=device)
+    start = start.numpy()
     np.testing.assert_array_equal(lower.numpy(), np.fmin.reduceat(np.fmin(x, np.inf), start[:-1], axis=1))
     np.testing.assert_array_equal(upper.numpy(), np.fmax.reduceat(np.fmax(x, -np.inf), start[:-1], axis=1))
 

@@ -326,7 +326,7 @@ def test_contact_takes_what_kinetic_energy_lacks_after_an_euler_step(among: str,
     acts in the same place without damping and friction, and those. At v0 alone they would take up to twice as much.
     """
     simulator, smooth = (make_crowd(among, integrator, rough=rough) for rough in (True, False))
-    smooth._add_forces(loss_weight=0.0)
+    smooth._stepper.add_forces(loss_weight=0.0)
     first, before = simulator.diagnostics(), simulator.velocities
     simulator.step()
     now = simulator.diagnostics()

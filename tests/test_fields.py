@@ -18,8 +18,10 @@ from worlds import make_material, make_scene, set_state, step_of, substeps_of
 
 from warpjelly.errors import InputError
 from warpjelly.kernels import fields
+from warpjelly.kernels.turns import Turn
 from warpjelly.scenefile import load_scene
-from warpjelly.simulator import MAX_CAPTURED_SUBSTEPS, Simulator
+from warpjelly.simulator import Simulator
+from warpjelly.stepping import MAX_CAPTURED_SUBSTEPS
 
 LOWER, UPPER = (-1.0, -2.0, 0.5), (2.0, 1.0, 1.5)
 
@@ -49,8 +51,11 @@ def field_forces(
     f = wp.zeros((3, len(points)), dtype=model.real, device=device)
     wp.launch(
         fields.add_field_forces,
-        dim=len(points),
+        dim=(1, 1),
         inputs=[
+            Turn(),
+            wp.array([0, len(points)], dtype=wp.int32, device=device),
+            1,
             charge,
             model.fields,
             step,
@@ -295,7 +300,7 @@ def test_the_clock_is_exact_after_many_steps(precision: str, device: str) -> Non
     assert sim.time == 100_000 * step_of(scene)
     # A sum of float64 steps would be off by 1e-9 s, of float32 steps by more than 1 ms. The force of float32 is
     # rounded, which is also what the springs do about the shape: within 1e-4 of 100 N.
-    sim._add_forces(loss_weight=0.0)
+    sim._stepper.add_forces(loss_weight=0.0)
     mean = sim.forces.mean(axis=0)[0]
     assert mean == pytest.approx(100_000 * step_of(scene), rel={"float32": 1e-6, "float64": 1e-14}[precision])
 
@@ -310,7 +315,7 @@ def test_fields_in_captured_frames_are_those_of_single_steps(device: str) -> Non
     captured, single = Simulator(scene, device=device), Simulator(scene, device=device)
     assert substeps_of(scene) > MAX_CAPTURED_SUBSTEPS
     captured.advance_frame()
-    single._capturable = False
+    single._stepper.capturable = False
     single.advance_frame()
     if device == "cpu":
         np.testing.assert_array_equal(captured.positions, single.positions)

@@ -32,13 +32,13 @@ def put(simulator: Simulator, x: np.ndarray, v: np.ndarray | None = None) -> Non
     state.x.assign(rows)
     state.x_start.assign(rows)
     state.v.assign(np.zeros_like(rows) if v is None else np.ascontiguousarray(np.asarray(v, float).T))
-    simulator._add_forces(loss_weight=simulator.dt)
+    simulator._stepper.add_forces(loss_weight=simulator.dt)
 
 
 def stored_energy(simulator: Simulator) -> float:
     """Return the energy of all overlaps, J."""
     assert simulator.model.skin is not None
-    return simulator._soft.measure()[0]
+    return simulator._stepper.soft.measure()[0]
 
 
 def loose_points(*groups: list[list[float]], masses: tuple[float, ...] = (), **changes: Any) -> Scene:
@@ -340,7 +340,7 @@ def launches_of(scene: Scene, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     with monkeypatch.context() as patch:
         patch.setattr(wp, "launch", record)
         patch.setattr(wp.HashGrid, "build", record_build)
-        simulator._substep()
+        simulator._stepper.launch_step()
     return names
 
 
@@ -383,7 +383,7 @@ def test_culling_does_not_change_a_bit(device: str, precision: str, integrator: 
     for _ in range(45):
         for simulator in (culled, full):
             simulator.step(50)
-        meetings.append(bool(culled._soft._meetings.numpy()[0]))
+        meetings.append(bool(culled._stepper.soft._meetings.numpy()[0]))
         for name in ("x", "v", "f", "pair_losses"):
             assert getattr(culled.state, name).numpy().tobytes() == getattr(full.state, name).numpy().tobytes(), name
     assert not meetings[0] and any(meetings) and not meetings[-1]
@@ -413,7 +413,7 @@ def test_only_chunks_near_another_body_are_searched(device: str, precision: str)
     simulator = Simulator(scene, device=device)
     x, body = simulator.positions, simulator.model.chunk_body.numpy()
     assert body.tolist() == [0, 0, 1, 1]
-    lower, upper = simulator._soft._near_lower.numpy().T, simulator._soft._near_upper.numpy().T
+    lower, upper = simulator._stepper.soft._near_lower.numpy().T, simulator._stepper.soft._near_upper.numpy().T
     # Chunks are layers along x: the second of the left cube and the first of the right one.
     for chunk, other in ((1, x[512:768]), (2, x[256:512])):
         np.testing.assert_array_equal([lower[chunk], upper[chunk]], [other.min(axis=0), other.max(axis=0)])

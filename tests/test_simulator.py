@@ -15,7 +15,8 @@ from reference import EPSILON, ROUND_OFF, Touch, World
 from worlds import make_material, make_scene, make_voxels, set_state
 
 from warpjelly.errors import DivergedError
-from warpjelly.simulator import MAX_CAPTURED_SUBSTEPS, Simulator
+from warpjelly.simulator import Simulator
+from warpjelly.stepping import MAX_CAPTURED_SUBSTEPS
 
 GRAVITY = [0.5, -9.81, 0.25]
 # A body with an edge contact, so that particles coincide at rest.

@@ -12,6 +12,7 @@ from worlds import make_material, make_scene, make_voxels
 
 from warpjelly.cells import Cells
 from warpjelly.kernels import springs
+from warpjelly.kernels.turns import Turn
 from warpjelly.lattice import build_lattice
 from warpjelly.model import PRECISIONS, spring_classes
 from warpjelly.scene import Material
@@ -139,13 +140,14 @@ def launch(
         wp.array(spans, dtype=wp.vec4i, device=device),
         wp.array(classes, dtype=wp.types.vector(3, real), device=device),
     ]
-    if kernel == "span":
-        function, dim = springs.add_span_forces, len(spans)
-    else:
-        function, dim = springs.add_spring_forces, (len(spans), springs.MAX_SPAN)
     # It adds to what was lost before.
     losses = wp.array(np.full(len(spans), 3.0), dtype=wp.float64, device=device)
     inputs = [*table, *rows[:2], real(0.25)]
+    if kernel == "span":
+        tasks = wp.array([[0, len(spans)]], dtype=wp.vec2i, device=device)
+        function, dim, inputs = springs.add_span_forces, 1, [Turn(), tasks, *inputs]
+    else:
+        function, dim = springs.add_spring_forces, (len(spans), springs.MAX_SPAN)
     wp.launch(function, dim=dim, inputs=inputs, outputs=[rows[2], losses], device=device)
     for span, lost in zip(spans, losses.numpy(), strict=True):
         i, j = (span[end] + np.arange(span[2]) for end in (0, 1))

@@ -42,6 +42,12 @@ SetOption = Annotated[
     ),
 ]
 DeviceOption = Annotated[str, typer.Option("--device", help="auto, cpu, cuda:0 ...; auto takes a GPU if there is one.")]
+ThreadsOption = Annotated[
+    int | None,
+    typer.Option(
+        "--threads", min=1, help="CPU threads, one per core unless given; results are the same.", show_default=False
+    ),
+]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else.")]
 
 
@@ -69,6 +75,7 @@ def run(
         typer.Option("-o", "--output", help="Run directory; outputs/<scene name> unless given.", show_default=False),
     ] = None,
     device: DeviceOption = "auto",
+    threads: ThreadsOption = None,
     frames: Annotated[
         int | None, typer.Option(min=1, help="Number of samples instead of the scene's.", show_default=False)
     ] = None,
@@ -135,7 +142,9 @@ def run(
         ended = None
         try:
             with _steps(lambda what: bar.update(task, description=what)):
-                result = simulate(loaded, output=output, device=device, force=force, resume=resume, progress=show)
+                result = simulate(
+                    loaded, output=output, device=device, threads=threads, force=force, resume=resume, progress=show
+                )
         except RunEndedError as error:
             ended, result = error, error.run
     if as_json:
@@ -152,6 +161,7 @@ def check(
     scene: SceneArgument,
     settings: SetOption = [],  # noqa: B006
     device: DeviceOption = "auto",
+    threads: ThreadsOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Validate a scene, count what it is made of, and estimate what a run takes."""
@@ -163,7 +173,7 @@ def check(
 
     console = Console(stderr=True, quiet=not sys.stderr.isatty())
     with _named(scene), console.status("reading") as status, _steps(status.update):
-        figures = forecast(loaded, device=device)
+        figures = forecast(loaded, device=device, threads=threads)
     if as_json:
         print(json.dumps(figures))
         return
@@ -531,12 +541,13 @@ def _named(path: Path) -> Iterator[None]:
 def _summarize(record: dict[str, Any], outcomes: list[Outcome]) -> None:
     """Print what came of a run."""
     rate = record["springs_per_second"] / 1e6
+    threads = f" with {record['threads']} threads" if record["threads"] > 1 else ""
     print(
         f"{record['scene']}: {record['frames']} frames of {record['voxels']:,} voxels, "
         f"{record['particles']:,} particles, {record['springs']:,} springs"
     )
     print(
-        f"{record['wall_seconds']:.1f} s on {record['device']}: {record['substeps']} substeps a frame of "
+        f"{record['wall_seconds']:.1f} s on {record['device']}{threads}: {record['substeps']} substeps a frame of "
         f"{record['dt'] * 1e3:.4g} ms, {rate:.0f} million springs/s"
     )
     for outcome in outcomes:

@@ -81,6 +81,7 @@ def simulate(
     *,
     output: str | Path | None = None,
     device: str = "auto",
+    threads: int | None = None,
     force: bool = False,
     resume: bool = False,
     progress: Callable[[int, int], None] = lambda done, total: None,
@@ -91,6 +92,7 @@ def simulate(
         scene: what to simulate.
         output: the run directory; ``outputs/<scene name>`` unless given.
         device: "auto", "cpu", "cuda:0" ...
+        threads: how many may be used on the CPU, None for one per core; results do not depend on it.
         force: replace a run that is there already.
         resume: go on with a run of this scene that is there already, however it ended, as if it had never ended; also
             one that has finished, if the scene has more frames now. Without one, start.
@@ -121,7 +123,7 @@ def simulate(
             if not (force or resume):
                 refuse_to_replace_run(folder)
             began = time.perf_counter()
-            sim = Simulator(plan_scene(scene), device=device)
+            sim = Simulator(plan_scene(scene), device=device, threads=threads)
             build_seconds = time.perf_counter() - began
             warn_of_deep_starts(sim)
             _warn_of_long_steps(sim)
@@ -217,6 +219,7 @@ def _simulate_into(
         "dt": sim.dt,
         "precision": scene.solver.precision,
         "build_seconds": build_seconds,
+        "threads": sim.threads,
         "wall_seconds": time.perf_counter() - began,
         "springs_per_second": sim.model.spring_count * forces / stepping if forces else 0.0,
         "diverged": isinstance(ended, DivergedError),
@@ -311,8 +314,8 @@ def _interrupts(number: int) -> bool:
     return in_main and signal.getsignal(number) is signal.default_int_handler
 
 
-def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
-    """Build a scene, step it for a moment, and say what a run of it takes.
+def forecast(scene: Scene, *, device: str = "auto", threads: int | None = None) -> dict[str, Any]:
+    """Build a scene, step it for a moment, and say what a run of it takes, with the same options.
 
     Returns:
         ``particles, springs, voxels``; ``materials``, the number of voxels of each by name; ``memory_bytes``, an
@@ -325,7 +328,7 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
         InputError: the scene cannot be built.
     """
     plan = plan_scene(scene)
-    sim = Simulator(plan, device=device)
+    sim = Simulator(plan, device=device, threads=threads)
     warn_of_deep_starts(sim)
     if broken := sim.broken_limit():
         log.warning("%s", broken)

@@ -1,25 +1,23 @@
-"""Substeps, culling and graph capture: a scene in motion."""
+"""A scene in motion: frames, what they show, and what is measured of them."""
 
 from __future__ import annotations
 
 import functools
 import logging
 import math
-import threading
 from typing import Any
 
 import numpy as np
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, diagnostics, fields, integrators, shapes
+from warpjelly.kernels import diagnostics, shapes
 
 from .device import choose_device
 from .errors import DivergedError, SceneError
-from .model import Model, State, build, launch_spring_forces
+from .model import Model, State, build
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
 from .shapes import ShapeFrame, starts_of
-from .softcontact import SoftContact
 from .stability import (
     BOUNCE_SHARE,
     MAGNETIC_GAIN,
@@ -31,14 +29,10 @@ from .stability import (
     magnetic_limits,
     step_limits,
 )
+from .stepping import MAX_CAPTURED_SUBSTEPS, Stepper, capture_lock
+from .team import available_cores
 
-log = logging.getLogger("warpjelly")
 steps = logging.getLogger("warpjelly.steps")
-
-# A captured graph holds at most this many substeps; longer frames replay it. Capturing costs as much as ten replays.
-MAX_CAPTURED_SUBSTEPS = 64
-# Warp cannot capture in two threads at once.
-_capture_lock = threading.Lock()
 
 
 class Simulator:
@@ -47,19 +41,22 @@ class Simulator:
     Args:
         scene: what to simulate, or its plan.
         device: "auto", "cpu", "cuda:0" ...
+        threads: how many may be used on the CPU, None for one per core; results do not depend on it.
 
     Raises:
         InputError: the scene cannot be built (SceneError), or there is no such device.
+        ValueError: threads is less than 1.
     """
 
-    def __init__(self, scene: Scene | Plan, *, device: str = "auto") -> None:
+    def __init__(self, scene: Scene | Plan, *, device: str = "auto", threads: int | None = None) -> None:
+        if threads is not None and threads < 1:
+            raise ValueError(f"cannot simulate with {threads} threads")
         plan = scene if isinstance(scene, Plan) else plan_scene(scene)
         self.scene = plan.scene
         self.device = choose_device(device)
         self.model: Model
         self.state: State
-        # Nor can Warp allocate in one thread while it captures in another.
-        with _capture_lock:
+        with capture_lock:
             self.model, self.state = build(plan, device=self.device)
         self.substep_count = 0
         """Substeps since the start."""
@@ -68,38 +65,29 @@ class Simulator:
         """Substeps per frame."""
         self.dt = self.scene.dt_for(self.substeps)
         """The time step used, s."""
-        chunk_count = len(self.model.chunk_body)
         self._point_start, self._normal_start = starts_of(self.model.shapes)
         point_count = int(self._point_start[-1])
         with wp.ScopedDevice(self.device):
-            # What only Runge-Kutta schemes need between their stages.
-            scratch = self.scene.solver.integrator in integrators.STAGES
-            self._v_start, self._x_sum, self._v_sum = (
-                wp.zeros_like(self.state.v) if scratch else None for _ in range(3)
-            )
-            self._lower = wp.zeros((3, chunk_count), dtype=self.model.real)
-            self._upper = wp.zeros((3, chunk_count), dtype=self.model.real)
             self._lost = wp.zeros(1, dtype=wp.int32)
             self._elastic = wp.zeros(1, dtype=wp.float64)
-            self._sums = wp.zeros((chunk_count, diagnostics.COLUMNS), dtype=wp.float64)
+            self._sums = wp.zeros((len(self.model.chunk_body), diagnostics.COLUMNS), dtype=wp.float64)
             self._points = wp.zeros(point_count, dtype=wp.vec3f)
             self._normals = wp.zeros(int(self._normal_start[-1]), dtype=wp.vec3f)
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
-        culling = self.scene.solver.culling
-        self._soft = SoftContact(self.model, self.state, culling=culling) if self.model.skin is not None else None
-        self._graphs: dict[int, Any] = {}
-        # On a GPU a graph would build grids from memory of the host that all of Warp's grids of one precision share:
-        # another simulator in this process would put its own there.
-        self._capturable = self._soft is None or self.device == "cpu"
-        # Kernels compile at their first launch, which must not be inside a capture; a step of no time changes nothing.
-        self._add_forces(loss_weight=0.0)
-        if scratch:
-            self._integrate_stage(0.0, 0.0, 0.0, first=True, last=True)
-        else:
-            self._integrate(0.0)
-        self._launch(integrators.count_step, 1, [], [self.state.step])
-        self.state.step.zero_()
+        self._stepper = Stepper(
+            self.model,
+            self.state,
+            integrator=self.scene.solver.integrator,
+            dt=self.dt,
+            culling=self.scene.solver.culling,
+            threads=available_cores() if threads is None else threads,
+        )
+
+    @property
+    def threads(self) -> int:
+        """How many threads of the CPU simulate; small scenes are not worth more than one."""
+        return self._stepper.threads
 
     @property
     def time(self) -> float:
@@ -139,7 +127,7 @@ class Simulator:
     def prepare(self) -> None:
         """Compile and capture what frames need, so that the first one takes no longer than the others."""
         for substeps in set(self._frame_blocks()):
-            self._graph(substeps)
+            self._stepper.prepare(substeps)
 
     def step(self, count: int = 1) -> None:
         """Advance by a number of substeps.
@@ -151,11 +139,7 @@ class Simulator:
             raise ValueError(f"cannot step back by {-count} substeps")
         frames, rest = divmod(count, self.substeps)
         for substeps in self._frame_blocks() * frames + [1] * rest:
-            if (graph := self._graph(substeps)) is not None:
-                wp.capture_launch(graph)
-            else:
-                for _ in range(substeps):
-                    self._substep()
+            self._stepper.step(substeps)
         self.substep_count += count
 
     def advance_frame(self) -> None:
@@ -273,8 +257,8 @@ class Simulator:
         total, greatest = sums.sum(axis=0), sums.max(axis=0)
         contact_losses = state.contact_losses.numpy().sum(axis=1) + state.pair_losses.numpy().sum(axis=1)
         pair_energy, pair_contacts, overlaps = 0.0, 0, np.zeros(len(model.bodies))
-        if self._soft is not None:
-            pair_energy, pair_contacts, overlaps = self._soft.measure()
+        if self._stepper.soft is not None:
+            pair_energy, pair_contacts, overlaps = self._stepper.soft.measure()
         penetrations = np.zeros(len(model.bodies))
         np.maximum.at(penetrations, model.chunk_body.numpy(), sums[:, diagnostics.DEPTH])
         return {
@@ -358,106 +342,3 @@ class Simulator:
         blocks = -(-self.substeps // MAX_CAPTURED_SUBSTEPS)
         short, longer = divmod(self.substeps, blocks)
         return [short + 1] * longer + [short] * (blocks - longer)
-
-    def _graph(self, substeps: int) -> Any:
-        """Return the captured graph of some substeps, None where the device cannot capture."""
-        if self._capturable and substeps not in self._graphs:
-            self._graphs[substeps] = self._capture(substeps)
-        return self._graphs[substeps] if self._capturable else None
-
-    def _capture(self, substeps: int) -> Any:
-        with _capture_lock:
-            try:
-                with wp.ScopedCapture(device=self.device) as capture:
-                    for _ in range(substeps):
-                        self._substep()
-            except RuntimeError as error:
-                self._capturable = False
-                log.warning(
-                    "%s cannot capture graphs (%s); launching kernel by kernel, which is slower", self.device, error
-                )
-                return None
-        return capture.graph
-
-    def _substep(self) -> None:
-        # By an Euler step kinetic energy gains the work of the forces at the mean of old and new velocities.
-        middle = self.dt / 2.0
-        if self.scene.solver.integrator == "semi_implicit_euler":
-            self._add_forces(loss_weight=self.dt, ahead=middle)
-            self._integrate(self.dt)
-        else:
-            stages = integrators.STAGES[self.scene.solver.integrator]
-            ahead = middle if len(stages) == 1 else 0.0
-            for number, (share, weight, reach) in enumerate(stages):
-                first, last = number == 0, number == len(stages) - 1
-                self._add_forces(loss_weight=weight * self.dt, offset=share * self.dt, ahead=ahead, first=first)
-                self._integrate_stage(self.dt, weight, reach, first=first, last=last)
-        self._launch(integrators.count_step, 1, [], [self.state.step])
-
-    def _integrate(self, dt: float) -> None:
-        model, state = self.model, self.state
-        self._launch(
-            integrators.semi_implicit_euler,
-            model.particle_count,
-            [model.particle_inv_mass, state.f, model.real(dt)],
-            [state.x_start, state.x, state.v],
-        )
-
-    def _integrate_stage(self, dt: float, weight: float, reach: float, *, first: bool, last: bool) -> None:
-        model, state = self.model, self.state
-        real = model.real
-        self._launch(
-            integrators.runge_kutta_stage,
-            model.particle_count,
-            [model.particle_inv_mass, state.f, real(dt), real(weight), real(reach), first, last],
-            [state.x_start, self._v_start, self._x_sum, self._v_sum, state.x, state.v],
-        )
-
-    def _add_forces(self, *, loss_weight: float, offset: float = 0.0, ahead: float = 0.0, first: bool = True) -> None:
-        """Overwrite the forces with those at the current positions and velocities.
-
-        Args:
-            loss_weight: what the power of dampers and friction counts for in the losses, and that of fields in their
-                work, s.
-            offset: time since the start of the step, s.
-            ahead: losses of contact are taken at the velocities that the forces make in this time, s.
-            first: whether this is the first evaluation of a step, which remembers contacts.
-        """
-        model, state = self.model, self.state
-        on_cpu = self.device == "cpu"
-        weight = model.real(loss_weight)
-        self._launch(fields.set_gravity_forces, model.particle_count, [model.particle_mass, model.gravity], [state.f])
-        if self.scene.fields:
-            self._launch(
-                fields.add_field_forces,
-                model.particle_count,
-                [
-                    *(model.particle_charge, model.fields, state.step, state.x, state.v),
-                    *(wp.float64(self.dt), wp.float64(offset), wp.float64(loss_weight)),
-                ],
-                [state.f, state.field_work],
-            )
-        launch_spring_forces(
-            *(model, model.spring_classes, state.x, state.v, state.f),
-            loss_weight=loss_weight,
-            losses=state.spring_losses,
-        )
-        chunk_count, lanes = len(model.chunk_body), 1 if on_cpu else contacts.PARALLEL_LANES
-        has_colliders = len(model.colliders.kind) > 0
-        boxes = [self._lower, self._upper]
-        if (self._soft is not None and self._soft.culls) or (has_colliders and self.scene.solver.culling):
-            self._launch(bounds.update_chunk_bounds, chunk_count, [model.chunk_start, state.x], boxes)
-        if self._soft is not None:
-            self._soft.add_forces(*boxes, dt=self.dt, loss_weight=loss_weight, ahead=ahead)
-        if not has_colliders:
-            return
-        self._launch(
-            contacts.add_contact_forces,
-            (chunk_count, lanes),
-            [
-                *(model.particle_mass, model.particle_inv_mass, model.chunk_start, model.chunk_body, model.colliders),
-                *(*boxes, state.x_start, state.x, state.v, state.step),
-                *(model.real(self.dt), weight, model.real(ahead), first, self.scene.solver.culling, lanes),
-            ],
-            [state.stamps, state.normals, state.f, state.contact_losses],
-        )

@@ -19,10 +19,12 @@ import numpy as np
 import warp as wp
 
 from warpjelly.kernels import contacts, fields
+from warpjelly.kernels.turns import Turn
 
 from .memory import LIMIT_EVALUATIONS
-from .model import Model, launch_spring_forces
+from .model import Model
 from .placing import BLOCK
+from .stepping import launch_spring_forces
 
 INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
 # Share of the limit that dt = "auto" takes. Away from rest springs turn and stretch, and the limit is lower: undamped
@@ -313,6 +315,7 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
     device = x.device
     v, f = wp.zeros_like(x), wp.zeros_like(x)
     losses = wp.zeros(len(model.spans), dtype=wp.float64, device=device)
+    phases = [(Turn(), wp.array([[0, len(model.spans)]], dtype=wp.vec2i, device=device))]
     classes = model.spring_classes.numpy().astype(float)
     root = np.sqrt(model.particle_inv_mass.numpy())
     # Row by row, here and below: of a large model temporaries of whole arrays would double what it takes.
@@ -329,7 +332,7 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
             for number, row in enumerate(vector):
                 v[number].assign(root * row)
             f.zero_()
-            launch_spring_forces(model, table, x, v, f, loss_weight=0.0, losses=losses)
+            launch_spring_forces(model, table, x, v, f, phases=phases, loss_weight=0.0, losses=losses)
             product = f.numpy()
             product *= -root
             return product

@@ -1,0 +1,78 @@
+"""Threads that replay a captured graph together on the CPU; kernels/turns.py says how they share the work."""
+
+from __future__ import annotations
+
+import ctypes
+import math
+import os
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from warpjelly.kernels.turns import Turn
+
+# What a control group allows its processes: time of processors per period, "max" for no limit, and the period.
+CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
+
+
+def available_cores() -> int:
+    """Return how many cores this process may use: those that it is bound to, but no more than its control group has."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if CPU_QUOTA.is_file():
+        quota, period = CPU_QUOTA.read_text().split()
+        if quota != "max":
+            cores = min(cores, math.ceil(int(quota) / int(period)))
+    return cores
+
+
+def _give_way() -> int:
+    """Return the address of the function of the system that lets other threads have the processor."""
+    library, name = ("kernel32", "SwitchToThread") if os.name == "nt" else (None, "sched_yield")
+    return ctypes.cast(getattr(ctypes.CDLL(library), name), ctypes.c_void_p).value or 0
+
+
+class Team:
+    """Threads, and what they know of each other while they replay a graph.
+
+    Args:
+        threads: how many there are, that of the caller included.
+        launches: how many launches a graph has at most.
+    """
+
+    def __init__(self, threads: int, launches: int) -> None:
+        self.threads = threads
+        self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._counts = wp.zeros((launches, 2), dtype=wp.int32, device="cpu")
+        self._used = 0
+        self._give_way = _give_way()
+
+    def begin(self) -> None:
+        """Begin the capture of a graph."""
+        self._used = 0
+
+    def turn(self, tasks: int) -> Turn:
+        """Return the turn of the next launch of the graph."""
+        if self._used == len(self._counts):
+            raise RuntimeError(f"a graph has more than the {self._used} launches that were expected")
+        turn = Turn()
+        turn.counts, turn.launch, turn.tasks, turn.give_way = self._counts, self._used, tasks, self._give_way
+        self._used += 1
+        return turn
+
+    def replay(self, graphs: list[Any]) -> None:
+        """Replay a graph that was captured once for all threads, or once for each of them."""
+        self._counts.numpy()[:] = 0
+        started: list[Future[None]] = []
+        try:
+            if self._helpers is not None:
+                for thread in range(1, self.threads):
+                    started.append(self._helpers.submit(wp.capture_launch, graphs[thread % len(graphs)]))
+            wp.capture_launch(graphs[0])
+        finally:
+            for helper in started:
+                # The work is done, so who has not begun is not needed; nor would threads of a process begin that was
+                # forked off.
+                if not helper.cancel():
+                    helper.result()
