@@ -20,7 +20,9 @@ from world_files import WORLDS
 import warpjelly as wj
 from warpjelly import cli, plan
 from warpjelly.meshes import EXTENSIONS, EXTRA_EXTENSIONS, load_mesh
+from warpjelly.run import forecast
 from warpjelly.scene import Scene
+from warpjelly.scenefile import load_scene
 from warpjelly.stage.stagefiles import open_stage
 from warpjelly.stage.validate import stage_problems
 
@@ -106,6 +108,19 @@ def test_run_and_the_python_interface_agree(warpjelly, tmp_path):
         surface = sim.positions[sim.model.shapes[0].particles[:, 0]]
         np.testing.assert_array_equal(np.asarray(mesh.GetPointsAttr().Get(frame)), surface)
     assert stage.GetEndTimeCode() == 2
+
+
+def test_steps_that_take_long_are_named():
+    """Hear what a check is doing, so that a terminal can show it."""
+    heard = []
+    with cli._steps(heard.append):
+        forecast(load_scene(SCENES / "tree_drop.toml"))
+    assert heard == [
+        "voxelising tree.obj at resolution 12",
+        "building 'tree' of 485 particles",
+        "finding the largest stable step",
+        "measuring how long a frame takes",
+    ]
 
 
 def test_validate_lists_every_problem_and_exits_with_1(warpjelly, tmp_path):

@@ -16,6 +16,8 @@ from worlds import make_scene, make_voxels
 from warpjelly.cells import Cells
 from warpjelly.kernels.springs import MAX_SPAN
 from warpjelly.lattice import Lattice, build_lattice, corner_labels, count_lattice
+from warpjelly.scene import Output
+from warpjelly.shapes import shapes_of
 from warpjelly.simulator import Simulator
 
 # Powers of two for edges and origin: positions in the grid come back exactly.
@@ -49,11 +51,13 @@ def check(cells: np.ndarray, particles_per_edge: int) -> None:
     ends = [frozenset((keys[i], keys[j])) for i, j in springs]
     assert Counter(zip(ends, kinds.tolist(), strict=True)) == Counter(expected.springs.items())
 
-    # Planned before built: particles exactly, springs never too few.
-    particles, bound, _, surface = count_lattice(Cells.of(cells), particles_per_edge=particles_per_edge)
-    assert particles == len(lattice.particles)
-    assert bound >= lattice.spring_count == len(springs)
-    assert surface == len(lattice.surface_quads) + 2
+    # Planned before built: particles and the surface exactly, springs never too few.
+    counts = count_lattice(Cells.of(cells), particles_per_edge=particles_per_edge)
+    assert counts.particles == len(lattice.particles)
+    assert counts.spring_bound >= lattice.spring_count == len(springs)
+    assert counts.skin == len(lattice.surface_particles)
+    (shown,) = shapes_of("body", lattice, Output())
+    assert counts.sides == len(shown.particles)
 
     check_surface(lattice, vertices, units)
 
@@ -156,7 +160,7 @@ def test_spring_bound_is_close_for_a_solid() -> None:
     """Bound the springs of a solid of 8^3 cubes within 10 %."""
     cells = np.ones((8, 8, 8), bool)
     lattice, _ = build_on_grid(cells)
-    assert lattice.spring_count <= count_lattice(Cells.of(cells))[1] <= 1.1 * lattice.spring_count
+    assert lattice.spring_count <= count_lattice(Cells.of(cells)).spring_bound <= 1.1 * lattice.spring_count
 
 
 def test_corner_table_lists_connected_cells() -> None:

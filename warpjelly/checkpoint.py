@@ -74,8 +74,8 @@ def load_checkpoint(path: Path) -> Checkpoint:
 
 
 def state_arrays(sim: Simulator) -> dict[str, np.ndarray]:
-    """Return copies of all that changes in a simulation."""
-    return {field.name: getattr(sim.state, field.name).numpy().copy() for field in fields(State)}
+    """Return all that changes in a simulation; on the CPU as views, which change with it."""
+    return {field.name: getattr(sim.state, field.name).numpy() for field in fields(State)}
 
 
 def restore_state(sim: Simulator, arrays: Mapping[str, np.ndarray]) -> None:

@@ -104,11 +104,21 @@ def run(
     loaded = _load(scene, overrides, frames)
 
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        SpinnerColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     with (
         _named(scene),
         Progress(
+            SpinnerColumn(),
+            TimeElapsedColumn(),
             TextColumn("{task.description}"),
             BarColumn(),
             MofNCompleteColumn(),
@@ -120,7 +130,7 @@ def run(
             transient=True,
         ) as bar,
     ):
-        task = bar.add_task("building", total=loaded.frame_count, rate="")
+        task = bar.add_task("reading", total=loaded.frame_count, rate="")
 
         def show(done: int, total: int) -> None:
             speed = bar.tasks[task].finished_speed or bar.tasks[task].speed
@@ -131,9 +141,10 @@ def run(
 
         ended = None
         try:
-            result = simulate(
-                loaded, output=output, device=device, threads=threads, force=force, resume=resume, progress=show
-            )
+            with _steps(lambda what: bar.update(task, description=what)):
+                result = simulate(
+                    loaded, output=output, device=device, threads=threads, force=force, resume=resume, progress=show
+                )
         except RunEndedError as error:
             ended, result = error, error.run
     if as_json:
@@ -156,9 +167,12 @@ def check(
     """Validate a scene, count what it is made of, and estimate what a run takes."""
     loaded = _load(scene, _overrides(settings), None)
 
+    from rich.console import Console
+
     from .run import forecast
 
-    with _named(scene):
+    console = Console(stderr=True, quiet=not sys.stderr.isatty())
+    with _named(scene), console.status("reading") as status, _steps(status.update):
         figures = forecast(loaded, device=device, threads=threads)
     if as_json:
         print(json.dumps(figures))
@@ -471,7 +485,7 @@ def doctor() -> None:
     import warp as wp
 
     from .device import start_warp
-    from .plan import memory_limit
+    from .memory import memory_limit
 
     start_warp()
     print(f"warpjelly {metadata.version('warpjelly')} on Python {platform.python_version()}, {platform.platform()}")
@@ -503,6 +517,20 @@ def main() -> None:
     # Termination is an interruption like Ctrl-C: the frames that were finished are saved.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     sys.exit(_guarded())
+
+
+@contextmanager
+def _steps(show: Callable[[str], None]) -> Iterator[None]:
+    """Show what is being done, as the steps that take long on large models log it."""
+    handler = logging.Handler()
+    handler.emit = lambda record: show(record.getMessage())  # type: ignore[method-assign]
+    steps = logging.getLogger("warpjelly.steps")
+    steps.setLevel(logging.INFO)
+    steps.addHandler(handler)
+    try:
+        yield
+    finally:
+        steps.removeHandler(handler)
 
 
 @contextmanager

@@ -20,7 +20,7 @@ def containing_cells(lattice: Lattice, points: np.ndarray) -> np.ndarray:
     """
     quads = lattice.surface_quads
     triangles = quads[:, [0, 1, 2, 0, 2, 3]].ravel()
-    corners = lattice.grid_coordinates(lattice.particles[lattice.surface_particles])
+    corners = lattice.grid_coordinates(lattice.positions(lattice.surface_particles))
     faces = wp.Mesh(
         points=wp.array(corners, dtype=wp.vec3f, device="cpu"), indices=wp.array(triangles, wp.int32, device="cpu")
     )
@@ -45,7 +45,7 @@ def containing_cells(lattice: Lattice, points: np.ndarray) -> np.ndarray:
 
 def face_cells(lattice: Lattice) -> np.ndarray:
     """Return the unit cell behind each face of the surface, int32 [face_count, 3]."""
-    points, quads = lattice.grid_coordinates(lattice.particles[lattice.surface_particles]), lattice.surface_quads
+    points, quads = lattice.grid_coordinates(lattice.positions(lattice.surface_particles)), lattice.surface_quads
     # Half a cell behind the middle of the face is the centre of the cell; area vectors here are two cells long.
     outward = area_vectors(points, np.full(len(quads), 4), quads.ravel())
     return np.floor(points[quads].mean(axis=1) - outward / 4).astype(np.int32)

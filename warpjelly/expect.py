@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from .placing import BLOCK
+
 if TYPE_CHECKING:
     from .simulator import Simulator
 
@@ -45,9 +47,12 @@ class Observer:
     def __init__(self, sim: Simulator) -> None:
         self._sim = sim
         self._expectations = list(sim.scene.expect.items())
-        self._rest = self._positions = sim.positions if self._expectations else np.zeros((0, 3))
+        quantities = {quantity for _, quantity, _ in self._expectations}
+        # Copies of large arrays, only for what needs them.
+        self._compares_shapes = bool(quantities & {"rotation", "shape_error"})
+        self._sees_speeds = "speed" in quantities
+        self._rest = self._positions = sim.positions if self._compares_shapes else np.zeros((0, 3))
         self._velocities = np.zeros((0, 3))
-        self._mass = sim.masses if self._expectations else np.zeros(0)
         self._centers: list[np.ndarray] = []
         self._heights: list[np.ndarray] = []
         self._depths: list[np.ndarray] = []
@@ -59,12 +64,19 @@ class Observer:
         if not self._expectations:
             return
         sim = self._sim
-        self._positions, self._velocities = sim.positions, sim.velocities
-        x, up = self._positions, sim.scene.up
+        self._see(sim)
+        x, mass = sim.state.x.numpy(), sim.model.particle_mass.numpy()
         parts = [body.particles for body in sim.model.bodies]
-        self._centers.append(np.array([self._mass[part] @ x[part] / self._mass[part].sum() for part in parts]))
-        self._heights.append(np.array([np.ptp(x[part, up]) for part in parts]))
+        self._centers.append(np.array([center_of_mass(x[:, part], mass[part]) for part in parts]))
+        self._heights.append(np.array([np.ptp(x[sim.scene.up, part]) for part in parts]))
         self._depths.append(penetrations)
+
+    def _see(self, sim: Simulator) -> None:
+        """Copy what is measured at the last frame that is observed."""
+        if self._compares_shapes:
+            self._positions = sim.positions
+        if self._sees_speeds:
+            self._velocities = sim.velocities
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return copies of what was observed, for a checkpoint after the current frame."""
@@ -82,7 +94,7 @@ class Observer:
             log.warning("what the scene expects is not measured: earlier frames were simulated without expectations")
             self._expectations = []
             return
-        self._positions, self._velocities = self._sim.positions, self._sim.velocities
+        self._see(self._sim)
         self._centers, self._heights, self._depths = (list(arrays[name]) for name in ("centers", "heights", "depths"))
 
     def outcomes(self) -> list[Outcome]:
@@ -131,6 +143,17 @@ class Observer:
 
     def _diverges(self, body: int) -> float:
         return float(self.diverged)
+
+
+def center_of_mass(x: np.ndarray, mass: np.ndarray) -> np.ndarray:
+    """Return the centre of mass of particles at x [3, count] with masses [count], float64 [3]; summed in float64."""
+    moment, total = np.zeros(3), 0.0
+    for start in range(0, len(mass), BLOCK):
+        part = slice(start, start + BLOCK)
+        weights = mass[part].astype(float)
+        moment += x[:, part] @ weights
+        total += weights.sum()
+    return np.asarray(moment / total)
 
 
 def rigid_fit(rest: np.ndarray, now: np.ndarray) -> np.ndarray:

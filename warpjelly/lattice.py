@@ -54,6 +54,8 @@ DIRECTIONS += DIRECTIONS[:3]
 KINDS = np.repeat([STRUCTURAL, FACE_SHEAR, BODY_SHEAR, BEND], [3, 6, 4, 3])
 # Vertices are numbered in int32.
 MAX_VERTICES = 2**31 - 1
+# Spans that are taken apart at a time, where few of their springs are looked for.
+_SPAN_BLOCK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -78,8 +80,8 @@ class SpringClasses:
 class Lattice:
     """One body at rest, in its own frame; in a network or a cloth, which have no cells, a particle counts as of one."""
 
-    particles: np.ndarray
-    """Rest positions, float64 [particle_count, 3], m."""
+    places: np.ndarray
+    """Where the particles rest, [particle_count, 3]: of cells, the vertices of the grid, int32; else float64, m."""
     spans: np.ndarray
     """Springs (i, j), (i + 1, j + 1), ... of one class as (i, j, count, class), by ascending i, at most MAX_SPAN each,
     int32 [span_count, 4]."""
@@ -99,9 +101,28 @@ class Lattice:
     """Lowest corner of the grid, float64 [3], m."""
 
     @property
+    def particle_count(self) -> int:
+        """Number of particles."""
+        return len(self.places)
+
+    @property
     def spring_count(self) -> int:
         """Number of springs."""
         return int(self.spans[:, 2].sum(dtype=np.int64))
+
+    @property
+    def particles(self) -> np.ndarray:
+        """Rest positions of all particles, float64 [particle_count, 3], m; of a large body, more than all the rest."""
+        return self.positions(slice(None))
+
+    def positions(self, particles: slice | np.ndarray) -> np.ndarray:
+        """Return the rest positions of some particles, float64 [..., 3], m."""
+        x = self.places[particles].astype(float)
+        if self.grid is not None:
+            # In place: at this size each temporary counts.
+            x *= self.unit
+            x += self.origin
+        return x
 
     def grid_coordinates(self, points: np.ndarray) -> np.ndarray:
         """Return points in the frame of the body, [..., 3], m, in unit cells from the origin of its grid."""
@@ -112,11 +133,25 @@ class Lattice:
 
         It takes some ten times the memory of the lattice itself.
         """
-        counts = self.spans[:, 2]
-        place = np.arange(self.spring_count) - np.repeat(np.cumsum(counts, dtype=np.int64) - counts, counts)
-        ends = np.repeat(self.spans[:, :2], counts, axis=0)
-        ends += place[:, None].astype(np.int32)
-        return ends, np.repeat(self.spans[:, 3], counts)
+        return _springs_of(self.spans)
+
+    def springs_among(self, chosen: np.ndarray) -> np.ndarray:
+        """Return both ends of each spring between chosen particles, bool [particle_count]: int32 [count, 2]."""
+        found = [np.zeros((0, 2), np.int32)]
+        for start in range(0, len(self.spans), _SPAN_BLOCK):
+            ends, _ = _springs_of(self.spans[start : start + _SPAN_BLOCK])
+            found.append(ends[chosen[ends].all(axis=1)])
+        return np.concatenate(found)
+
+
+def _springs_of(spans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Take spans apart: both ends of each spring, int32 [spring_count, 2], and its class, int32 [spring_count]."""
+    counts = spans[:, 2]
+    first = np.cumsum(counts, dtype=np.int64) - counts
+    place = np.arange(counts.sum(dtype=np.int64)) - np.repeat(first, counts)
+    ends = np.repeat(spans[:, :2], counts, axis=0)
+    ends += place[:, None].astype(np.int32)
+    return ends, np.repeat(spans[:, 3], counts)
 
 
 def build_lattice(
@@ -148,14 +183,10 @@ def build_lattice(
     vertices = wp.empty(particle_count, dtype=wp.vec3i, device="cpu")
     cell_counts = wp.zeros((grid.material_count, particle_count), dtype=wp.uint8, device="cpu")
     _launch(place_particles, len(grid.run_row), [grid], [vertices, cell_counts])
-    particles = vertices.numpy().astype(float)
-    # In place: at this size each temporary counts.
-    particles *= unit
-    particles += origin
     spans, classes = _connect(grid, unit, weighted)
     surface_particles, surface_quads = _skin(grid, particle_count)
     return Lattice(
-        particles=particles,
+        places=vertices.numpy(),
         spans=spans,
         classes=classes,
         cell_counts=cell_counts.numpy(),
@@ -172,35 +203,69 @@ def order_spans(spans: np.ndarray) -> np.ndarray:
     return spans[np.argsort(spans[:, 0], kind="stable")]
 
 
-def count_lattice(
-    cells: Cells, *, particles_per_edge: int = 2, materials: Sequence[Cells] = ()
-) -> tuple[int, int, int, int]:
+@dataclass(frozen=True)
+class LatticeCounts:
+    """What ``build_lattice`` would make."""
+
+    particles: int
+    spring_bound: int
+    """No more springs than this; close for thick bodies."""
+    span_estimate: int
+    """About as many spans of springs as this."""
+    skin: int
+    """Number of particles on the surface."""
+    sides: int
+    """The same, each once for each direction of faces that it is a corner of."""
+
+
+def count_lattice(cells: Cells, *, particles_per_edge: int = 2, materials: Sequence[Cells] = ()) -> LatticeCounts:
     """Count what ``build_lattice`` would make without making it, from the corners, edges and faces of the jelly cubes.
 
     Args:
         cells: occupied jelly cubes.
         particles_per_edge: particles along an edge of each jelly cube, at least 2.
         materials: jelly cubes of each material, as for ``build_lattice``.
-
-    Returns:
-        The number of particles, exact; an upper bound of the number of springs, close for thick bodies; about the
-        number of spans of springs and of points on the surface.
     """
     vertices = _Vertices(cells)
     seen = np.bincount(vertices.patterns, vertices.lengths, minlength=256).astype(np.int64)
-    corners, edges, faces, cubes = (seen @ _pattern_parts()).tolist()
+    every, skin, sides, (faces, cubes) = np.tensordot(seen, _pattern_parts(), 1).tolist()
     n = particles_per_edge - 1
-    particles = corners + edges * (n - 1) + faces * (n - 1) ** 2 + cubes * (n - 1) ** 3
+    corners, edges = every
     unit_edges = edges * n + faces * 2 * n * (n - 1) + cubes * 3 * n * (n - 1) ** 2
     unit_faces = faces * n**2 + cubes * 3 * n**2 * (n - 1)
-    # Bend springs join consecutive structural ones, so there are fewer of them.
-    # Each face of a cube is shared or exposed, and a closed surface of quads has about as many points as faces.
-    exposed = 2 * faces - 6 * cubes
+    # Each face of a cube is shared or exposed.
+    exposed = (2 * faces - 6 * cubes) * (n - 1) ** 2
     # Each of the directions of springs makes about one span of each row of unit cells alike, or more where it is long.
-    spans = len(DIRECTIONS) * sum(
-        part.run_count * n**2 + part.count * n**3 // MAX_SPAN for part in materials or [cells]
+    lengths = np.concatenate([np.diff(part.edges)[::2] for part in materials or [cells]]) * n + 1
+    return LatticeCounts(
+        particles=corners + edges * (n - 1) + faces * (n - 1) ** 2 + cubes * (n - 1) ** 3,
+        # Bend springs join consecutive structural ones, so there are fewer of them.
+        spring_bound=2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3,
+        span_estimate=len(DIRECTIONS) * int((-(-lengths // MAX_SPAN)).sum()) * n**2,
+        skin=skin[0] + skin[1] * (n - 1) + exposed,
+        sides=sides[0] + sides[1] * (n - 1) + exposed,
     )
-    return particles, 2 * unit_edges + 2 * unit_faces + 4 * cubes * n**3, spans, exposed * n**2 + 2
+
+
+# Bits of the numbers of cells around a vertex, which stand for the axes x, y and z.
+_AXES = (4, 2, 1)
+
+
+def _joined_cells(pattern: int, axes: Sequence[int]) -> list[list[int]]:
+    """Return the cells of a pattern in groups that are connected through faces across some axes.
+
+    Groups are in the order of their first cells. Cells share a face when their numbers differ in one bit.
+    """
+    groups: list[list[int]] = []
+    left = [cell for cell in range(8) if pattern >> cell & 1]
+    while left:
+        group = [left.pop(0)]
+        for cell in group:
+            near = [cell ^ axis for axis in axes if cell ^ axis in left]
+            group += near
+            left = [other for other in left if other not in near]
+        groups.append(group)
+    return groups
 
 
 @functools.cache
@@ -216,35 +281,39 @@ def corner_labels() -> tuple[np.ndarray, np.ndarray]:
     labels = np.full((256, 8), 255, np.uint8)
     counts = np.zeros(256, np.uint8)
     for pattern in range(256):
-        for start in range(8):
-            if not pattern >> start & 1 or labels[pattern, start] != 255:
-                continue
-            front = [start]
-            while front:
-                cell = front.pop()
-                labels[pattern, cell] = counts[pattern]
-                # Cells share a face around the vertex when their numbers differ in one bit.
-                front += [n for n in (cell ^ 1, cell ^ 2, cell ^ 4) if pattern >> n & 1 and labels[pattern, n] == 255]
-            counts[pattern] += 1
+        groups = _joined_cells(pattern, _AXES)
+        for number, group in enumerate(groups):
+            labels[pattern, group] = number
+        counts[pattern] = len(groups)
     return labels, counts
 
 
 @functools.cache
 def _pattern_parts() -> np.ndarray:
-    """Count corners, edges, faces and cubes of jelly cubes by the vertex they begin at, for each pattern, [256, 4].
+    """Count parts of jelly cubes by the vertex that they begin at, for each pattern, int64 [256, 4, 2].
 
+    Corners and edges: all, those of exposed faces, and the same for each direction of such faces; faces and cubes.
     Edges, faces and cubes begin at their lowest vertex. An edge between two cubes that only touch there is two edges.
     """
-    parts = np.zeros((256, 4), np.int64)
-    parts[:, 0] = corner_labels()[1]
+    parts = np.zeros((256, 4, 2), np.int64)
     for pattern in range(256):
-        for axis in (1, 2, 4):
-            above = [pattern >> cell & 1 for cell in range(8) if cell & axis]
-            parts[pattern, 1] += 2 if above in ([1, 0, 0, 1], [0, 1, 1, 0]) else any(above)
+        parts[pattern, :3, 0] = _count_groups(pattern, _AXES)
+        for axis in _AXES:
+            above = sum(1 << cell for cell in range(8) if cell & axis and pattern >> cell & 1)
+            parts[pattern, :3, 1] += _count_groups(above, [other for other in _AXES if other != axis])
             # The face across this axis lies between the last cell and the one below it.
-            parts[pattern, 2] += (pattern >> 7 | pattern >> (7 - axis)) & 1
-        parts[pattern, 3] = pattern >> 7
+            parts[pattern, 3, 0] += (pattern >> 7 | pattern >> (7 - axis)) & 1
+        parts[pattern, 3, 1] = pattern >> 7
     return parts
+
+
+def _count_groups(pattern: int, axes: Sequence[int]) -> tuple[int, int, int]:
+    """Count groups of joined cells: all, those with exposed faces across some axes, and the directions of these."""
+    groups = _joined_cells(pattern, axes)
+    directions = [
+        {(axis, cell & axis) for cell in group for axis in axes if not pattern >> (cell ^ axis) & 1} for group in groups
+    ]
+    return len(groups), sum(map(bool, directions)), sum(map(len, directions))
 
 
 class _Vertices:

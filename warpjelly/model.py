@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -13,16 +14,13 @@ from warpjelly.kernels import bounds, contacts, fields, pairs
 from warpjelly.kernels.lattices import BEND, BODY_SHEAR, FACE_SHEAR, STRUCTURAL
 from warpjelly.kernels.shapes import Shapes
 
-from .errors import SceneError
 from .lattice import Lattice
+from .placing import place_body
 from .plan import Plan
 from .scene import (
-    DEFAULT_PARTICLE_MASS,
-    AnyBody,
     AnyCollider,
     BoxCollider,
     ConstantField,
-    CubeBody,
     GridField,
     MagneticField,
     Material,
@@ -31,6 +29,8 @@ from .scene import (
     SphereCollider,
 )
 from .shapes import Shape, shapes_of, starts_of
+
+steps = logging.getLogger("warpjelly.steps")
 
 # Most particles of a chunk. Its box should be small against a body, and cheap against its particles.
 CHUNK_SIZE = 256
@@ -46,9 +46,6 @@ PAGE, ROW_SHIFT = 4096, 896
 YOUNG = {STRUCTURAL: 0.4, FACE_SHEAR: 0.2, BODY_SHEAR: 0.15, BEND: 0.05}
 # Damping over stiffness of law young, unless given, s.
 DAMPING_TIME = 5e-4
-# Boxes of pinned particles are grown by this share of a unit cell, so that rounding decides nothing.
-PIN_MARGIN = 1e-6
-
 PRECISIONS = {"float32": wp.float32, "float64": wp.float64}
 
 
@@ -76,7 +73,7 @@ class Model:
     particle_inv_mass: wp.array
     """real [particle_count], 1/kg; 0 for pinned particles."""
     particle_charge: wp.array
-    """real [particle_count], C."""
+    """real [particle_count], C; empty without fields."""
     spans: wp.array
     """(i, j, count, class) of each run of springs, vec4i [span_count]."""
     spring_classes: wp.array
@@ -132,105 +129,117 @@ class State:
 
 def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     """Build every body and put the scene on a device at time zero."""
-    scene = plan.scene
+    scene, count = plan.scene, plan.particle_count
     real = PRECISIONS[scene.solver.precision]
     vector = wp.types.vector(3, real)
+    # Rows per component: see kernels/__init__.py. Memory is taken up where it is written, body after body; what is not
+    # needed to build comes after the last one.
+    rows = new_rows(4, count, real, device)
+    # On the CPU the arrays themselves.
+    x, v = (row.numpy() for row in rows[:2])
+    mass, inv_mass = (np.empty(count, x.dtype) for _ in range(2))
     bodies: list[Body] = []
-    positions, velocities, masses, inverse_masses, charges = ([] for _ in range(5))
-    spans, classes, chunks, chunk_bodies = ([] for _ in range(4))
-    lattices: list[Lattice] = []
+    spans, classes, chunks, centers = ([] for _ in range(4))
+    skins: list[_Skin] = []
     shapes: list[Shape] = []
     shape_starts: list[int] = []
-    particle_count = spring_count = class_count = 0
-    for number, body_plan in enumerate(plan.bodies):
+    first = class_count = 0
+    for body_plan in plan.bodies:
         body, materials = body_plan.body, [scene.materials[name] for name in body_plan.materials]
+        steps.info("building '%s' of %s particles", body.name, f"{body_plan.particle_count:,}")
         lattice = body_plan.build()
-        count = len(lattice.particles)
-        if scene.soft_contacts:
-            lattices.append(lattice)
-        mass = _masses(lattice, materials)
-        pinned = _pinned(lattice, body)
-        x, v = place(lattice, mass, body)
-        v[pinned] = 0.0
-        positions.append(x)
-        velocities.append(v)
-        masses.append(mass)
-        inverse_masses.append(np.where(pinned, 0.0, 1.0 / mass))
-        charges.append(np.full(count, body.charge))
-        spans.append(lattice.spans + np.array([particle_count, particle_count, 0, class_count], np.int32))
-        classes.append(spring_classes(materials, lattice))
-        chunks.append(np.arange(particle_count, particle_count + count, CHUNK_SIZE, dtype=np.int32))
-        chunk_bodies.append(np.full(len(chunks[-1]), number, np.int32))
+        own = slice(first, first + lattice.particle_count)
+        bodies.append(Body(name=str(body.name), particles=own, unit=lattice.unit))
         shapes += shapes_of(str(body.name), lattice, scene.output, body_plan.model)
-        shape_starts += [particle_count] * (len(shapes) - len(shape_starts))
-        bodies.append(
-            Body(
-                name=str(body.name),
-                particles=slice(particle_count, particle_count + count),
-                unit=lattice.unit,
-            )
-        )
-        particle_count += count
-        spring_count += lattice.spring_count
+        shape_starts += [first] * (len(shapes) - len(shape_starts))
+        if scene.soft_contacts:
+            skins.append(_skin_of(lattice))
+        start = {"x": x[:, own], "v": v[:, own], "mass": mass[own], "inv_mass": inv_mass[own]}
+        centers.append(place_body(lattice, materials, body, **start))
+        chunks.append(np.arange(own.start, own.stop, CHUNK_SIZE, dtype=np.int32))
+        classes.append(spring_classes(materials, lattice))
+        spans.append(lattice.spans)
+        # In place: the lattice is not needed any more.
+        spans[-1] += np.array([first, first, 0, class_count], np.int32)
+        first = own.stop
         class_count += len(classes[-1])
+        del lattice
 
     def array(data: Any, dtype: Any) -> wp.array:
-        return wp.array(np.asarray(data), dtype=dtype, device=device)
+        # On the CPU the array is the data itself.
+        return wp.array(np.asarray(data), dtype=dtype, device=device, copy=False)
 
-    mass = np.concatenate(masses)
-    x, v = np.concatenate(positions), np.concatenate(velocities)
+    chunk_counts = [len(part) for part in chunks]
+    all_spans = _joined(spans)
+    sizes = [part.particle_count if scene.fields else 0 for part in plan.bodies]
+    charges = np.repeat([part.body.charge for part in plan.bodies], sizes)
     model = Model(
         bodies=bodies,
         real=real,
         voxel_count=plan.voxel_count,
-        particle_count=particle_count,
-        spring_count=spring_count,
+        particle_count=count,
+        spring_count=int(all_spans[:, 2].sum(dtype=np.int64)),
         particle_mass=array(mass, real),
-        particle_inv_mass=array(np.concatenate(inverse_masses), real),
-        particle_charge=array(np.concatenate(charges), real),
-        spans=array(np.concatenate(spans), wp.vec4i),
+        particle_inv_mass=array(inv_mass, real),
+        particle_charge=array(charges, real),
+        spans=array(all_spans, wp.vec4i),
         spring_classes=array(np.concatenate(classes), vector),
-        chunk_start=array(np.append(np.concatenate(chunks), np.int32(particle_count)), wp.int32),
-        chunk_body=array(np.concatenate(chunk_bodies), wp.int32),
-        body_chunk_start=array(np.cumsum([0, *map(len, chunks)]), wp.int32),
+        chunk_start=array(np.append(np.concatenate(chunks), np.int32(count)), wp.int32),
+        chunk_body=array(np.repeat(np.arange(len(bodies), dtype=np.int32), chunk_counts), wp.int32),
+        body_chunk_start=array(np.cumsum([0, *chunk_counts]), wp.int32),
         gravity=array(scene.gravity_vector[None], vector),
-        colliders=_colliders(scene, [_center_of_mass(x[b.particles], mass[b.particles]) for b in bodies], real, device),
+        colliders=_colliders(scene, centers, real, device),
         fields=_fields(scene, real, device),
         shapes=shapes,
         shape_table=_shape_table(shapes, shape_starts, device),
-        skin=_skin(scene, lattices, real, device) if scene.soft_contacts else None,
+        skin=_skin(scene, bodies, skins, real, device) if skins else None,
     )
     slots = int(model.colliders.slot.numpy().max(initial=-1)) + 1
     remembered = int(model.colliders.entry_normal.numpy().sum())
-    # Rows per component: see kernels/__init__.py.
-    rows = zero_rows(4, particle_count, real, device)
-    for target, values in zip(rows, (x, v, None, x), strict=True):
-        if values is not None:
-            target.assign(np.ascontiguousarray(values.T, wp.dtype_to_numpy(real)))
+    if not rows[0].device.is_cpu:
+        rows[0].assign(x)
+        rows[1].assign(v)
+    rows[2].zero_()
+    wp.copy(rows[3], rows[0])
     state = State(
         x=rows[0],
         v=rows[1],
         f=rows[2],
         x_start=rows[3],
         step=wp.zeros(1, dtype=wp.int64, device=device),
-        stamps=wp.full((slots, particle_count), -2, dtype=wp.int32, device=device),
-        normals=wp.zeros((3 * remembered, particle_count), dtype=real, device=device),
+        stamps=wp.full((slots, count), -2, dtype=wp.int32, device=device),
+        normals=wp.zeros((3 * remembered, count), dtype=real, device=device),
         spring_losses=wp.zeros(len(model.spans), dtype=wp.float64, device=device),
         pair_losses=wp.zeros(
             (2, 0 if model.skin is None else len(model.skin.particles)), dtype=wp.float64, device=device
         ),
-        field_work=wp.zeros(particle_count if scene.fields else 0, dtype=wp.float64, device=device),
+        field_work=wp.zeros(len(charges), dtype=wp.float64, device=device),
         contact_losses=wp.zeros((2, len(model.chunk_body)), dtype=wp.float64, device=device),
     )
     return model, state
 
 
-def zero_rows(count: int, particle_count: int, real: type, device: Any) -> list[wp.array]:
-    """Return some arrays, real [3, particle_count] each, whose rows begin in different places of a page."""
+def _joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+    """Return arrays one after the other; a single one as it is, not as a copy."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def new_rows(count: int, particle_count: int, real: type, device: Any) -> list[wp.array]:
+    """Return some arrays, real [3, particle_count] each and not set, whose rows begin in different places of a page."""
     size = wp.types.type_size_in_bytes(real)
     stride = (-(-particle_count * size // PAGE) * PAGE + ROW_SHIFT) // size
-    block = wp.zeros((3 * count, stride), dtype=real, device=device)
+    block = wp.empty((3 * count, stride), dtype=real, device=device)
+    # What is between the rows.
+    block[:, particle_count:].zero_()
     return [block[3 * number : 3 * number + 3, :particle_count] for number in range(count)]
+
+
+def zero_rows(count: int, particle_count: int, real: type, device: Any) -> list[wp.array]:
+    """Return such arrays full of zeros."""
+    rows = new_rows(count, particle_count, real, device)
+    for row in rows:
+        row.zero_()
+    return rows
 
 
 def spring_classes(materials: Sequence[Material], lattice: Lattice) -> np.ndarray:
@@ -280,67 +289,6 @@ def _young(material: Material, lattice: Lattice, number: int) -> np.ndarray:
     stiffness *= material.youngs_modulus * lattice.unit
     time = DAMPING_TIME if material.damping_time is None else material.damping_time
     return np.stack([stiffness, stiffness * time])
-
-
-def _masses(lattice: Lattice, materials: Sequence[Material]) -> np.ndarray:
-    """Return the mass of each particle, float64 [particle_count], kg.
-
-    Each cell that shares a particle adds an eighth of its mass or, with ``particle_mass``, its part of a mean.
-    """
-    mass = np.zeros(len(lattice.particles))
-    for material, cells in zip(materials, lattice.cell_counts, strict=True):
-        if material.density is not None:
-            mass += material.density * lattice.unit**3 / 8.0 * cells
-        else:
-            given = DEFAULT_PARTICLE_MASS if material.particle_mass is None else material.particle_mass
-            mass += given * (cells / lattice.cell_counts.sum(axis=0))
-    return mass
-
-
-def _center_of_mass(positions: np.ndarray, mass: np.ndarray) -> np.ndarray:
-    return mass @ positions / mass.sum()
-
-
-def _pinned(lattice: Lattice, body: AnyBody) -> np.ndarray:
-    """Return which particles never move, bool [particle_count].
-
-    Raises:
-        SceneError: an entry pins a particle that does not exist, or none at all.
-    """
-    x = lattice.particles
-    pinned = np.zeros(len(x), bool)
-    for number, pin in enumerate(body.pinned):
-        key = f"bodies.{body.name}.pinned.{number}"
-        if pin.indices is not None:
-            if max(pin.indices) >= len(x):
-                raise SceneError(f"{key}.indices: no particle {max(pin.indices)}; they are 0 to {len(x) - 1}")
-            pinned[pin.indices] = True
-        else:
-            margin = PIN_MARGIN * lattice.unit
-            inside = ((x >= np.array(pin.lower) - margin) & (x <= np.array(pin.upper) + margin)).all(axis=1)
-            if not inside.any():
-                low, high = (np.array2string(corner, precision=4, separator=", ") for corner in (x.min(0), x.max(0)))
-                raise SceneError(f"{key}: pins no particle; the body reaches from {low} to {high} m in its own frame")
-            pinned |= inside
-    return pinned
-
-
-def place(lattice: Lattice, mass: np.ndarray, body: AnyBody) -> tuple[np.ndarray, np.ndarray]:
-    """Return positions and velocities of a body at time zero, float64 [particle_count, 3] each."""
-    turn = np.eye(3)
-    for axis, angle in enumerate(np.radians(body.rotation)):
-        u, w = (axis + 1) % 3, (axis + 2) % 3
-        about = np.eye(3)
-        about[[u, w], [u, w]] = np.cos(angle)
-        about[w, u], about[u, w] = np.sin(angle), -np.sin(angle)
-        turn = about @ turn
-    x = lattice.particles @ turn.T + body.position
-    if isinstance(body, CubeBody) and body.positions is not None:
-        x = np.array(body.positions)
-    if isinstance(body, CubeBody) and body.velocities is not None:
-        return x, np.array(body.velocities)
-    arm = x - _center_of_mass(x, mass)
-    return x, np.asarray(body.velocity) + np.cross(body.angular_velocity, arm)
 
 
 def _fields(scene: Scene, real: type, device: str) -> Any:
@@ -409,40 +357,55 @@ def _shape_table(shapes: Sequence[Shape], first_particles: Sequence[int], device
     return table
 
 
-def _skin(scene: Scene, lattices: Sequence[Lattice], real: type, device: str) -> Any:
+@dataclass(frozen=True)
+class _Skin:
+    """What one body adds to the table of the particles that collide with each other."""
+
+    particles: np.ndarray
+    """Those of them in the body, ascending, int [count]."""
+    radius: float
+    """Half of a unit cell's edge, m."""
+    rest: np.ndarray
+    """Where they rest, float64 [count, 3], m."""
+    springs: np.ndarray
+    """Numbers of both ends of each spring between them, from either end, ascending by the first, int [count, 2]."""
+
+
+def _skin_of(lattice: Lattice) -> _Skin:
+    on_skin = np.zeros(lattice.particle_count, bool)
+    on_skin[lattice.surface_particles] = True
+    members = np.flatnonzero(on_skin)
+    inner = np.searchsorted(members, lattice.springs_among(on_skin))
+    ends = np.concatenate([inner, inner[:, ::-1]])
+    ends = ends[np.argsort(ends[:, 0], kind="stable")]
+    return _Skin(members, lattice.unit / 2, lattice.positions(members), ends)
+
+
+def _skin(scene: Scene, bodies: Sequence[Body], skins: Sequence[_Skin], real: type, device: str) -> Any:
     """Return the table of the particles that collide with each other."""
     contact = scene.soft_contact
-    particles, bodies, chunks, radii, rest, starts, neighbors = ([] for _ in range(7))
-    first = count = chunk_count = neighbor_count = 0
-    for number, lattice in enumerate(lattices):
-        on_skin = np.zeros(len(lattice.particles), bool)
-        on_skin[lattice.surface_particles] = True
-        members = np.flatnonzero(on_skin)
-        member = np.cumsum(on_skin) - 1 + count
-        # Springs within the skin, from both ends, sorted by the first.
-        springs, _ = lattice.springs()
-        inner = springs[on_skin[springs].all(axis=1)]
-        ends = member[np.concatenate([inner, inner[:, ::-1]])]
-        ends = ends[np.argsort(ends[:, 0], kind="stable")]
-        degree = np.bincount(ends[:, 0] - count, minlength=len(members))
+    particles, owners, chunks, radii, rest, starts, neighbors = ([] for _ in range(7))
+    count = chunk_count = neighbor_count = 0
+    for number, (body, skin) in enumerate(zip(bodies, skins, strict=True)):
+        size = len(skin.particles)
+        degree = np.bincount(skin.springs[:, 0], minlength=size)
         starts.append(neighbor_count + np.cumsum(degree) - degree)
-        neighbors.append(ends[:, 1])
-        particles.append(members + first)
-        bodies.append(np.full(len(members), number))
-        chunks.append(chunk_count + members // CHUNK_SIZE)
-        radii.append(np.full(len(members), lattice.unit / 2 if contact.radius is None else contact.radius))
-        rest.append(lattice.particles[members])
-        first += len(lattice.particles)
-        count += len(members)
-        chunk_count += -(-len(lattice.particles) // CHUNK_SIZE)
-        neighbor_count += len(ends)
+        neighbors.append(count + skin.springs[:, 1])
+        particles.append(body.particles.start + skin.particles)
+        owners.append(np.full(size, number))
+        chunks.append(chunk_count + skin.particles // CHUNK_SIZE)
+        radii.append(np.full(size, skin.radius if contact.radius is None else contact.radius))
+        rest.append(skin.rest)
+        count += size
+        chunk_count += -(-(body.particles.stop - body.particles.start) // CHUNK_SIZE)
+        neighbor_count += len(skin.springs)
 
     def array(parts: list[np.ndarray], dtype: Any) -> wp.array:
         return wp.array(np.concatenate(parts), dtype=dtype, device=device)
 
     table = pairs.SKIN[real]()
     table.particles = array(particles, wp.int32)
-    table.body = array(bodies, wp.int32)
+    table.body = array(owners, wp.int32)
     table.chunk = array(chunks, wp.int32)
     table.radius = array(radii, real)
     table.rest = array(rest, wp.types.vector(3, real))

@@ -37,7 +37,7 @@ def build_network(
         rest = np.array(rest_lengths, float)
     table, rows = np.unique(np.stack([kinds, rest], axis=1), axis=0, return_inverse=True)
     return Lattice(
-        particles=particles,
+        places=particles,
         spans=_join_runs(ends, rows.reshape(-1)),
         classes=SpringClasses(table[:, 0].astype(int), table[:, 1], np.ones((len(table), 1))),
         cell_counts=np.ones((1, len(particles)), np.uint8),
@@ -67,7 +67,7 @@ def build_cloth(size: tuple[float, float], particles: tuple[int, int]) -> Lattic
     ]
     corners = [number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]]
     return Lattice(
-        particles=np.stack([*np.meshgrid(x, [0.0], z, indexing="ij")], axis=-1).reshape(-1, 3),
+        places=np.stack([*np.meshgrid(x, [0.0], z, indexing="ij")], axis=-1).reshape(-1, 3),
         spans=_join_runs(
             np.concatenate([np.stack([first.ravel(), second.ravel()], axis=1) for _, _, first, second in families]),
             np.repeat(np.arange(len(families)), [first.size for _, _, first, _ in families]),

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +18,19 @@ from warpjelly.kernels.lattices import MAX_MATERIALS
 from .cells import Cells
 from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
+from .memory import (
+    BYTES_PER_BUILT_PARTICLE,
+    BYTES_PER_BUILT_SPAN,
+    BYTES_PER_CROSSING,
+    BYTES_PER_NUMBER,
+    BYTES_PER_ROW,
+    BYTES_PER_SAMPLE,
+    MAX_ROW_BYTES,
+    PROGRAM_BYTES,
+    body_bytes,
+    memory_limit,
+    peak_bytes,
+)
 from .network import build_cloth, build_network
 from .scene import (
     MAX_LENGTH,
@@ -43,36 +54,19 @@ if TYPE_CHECKING:
     from .voxelize import VoxelGrid
 
 log = logging.getLogger("warpjelly")
+# What takes long on a large model says so here.
+steps = logging.getLogger("warpjelly.steps")
 
-# Warp's strides are int32, so a row of an array [3, particle_count] holds at most this many bytes.
-MAX_ROW_BYTES = 2**31 - 1
-BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
-
-# Bytes at the peak of building and running a scene, as measured: within 15 %.
-BYTES_AT_REST = 300e6
-BYTES_PER_PARTICLE = {"float32": 240, "float64": 280}
-BYTES_PER_SPAN = 64
-# Where the vertices of a row along z are, for all rows of the grid, also where nothing is occupied.
-BYTES_PER_ROW = 16
 # With law "young" springs near the surface differ, so there are so many spans more per face of a jelly cube.
 YOUNG_SPANS = 2
-# Bytes at the peak of building a lattice alone.
-BYTES_PER_BUILT_PARTICLE, BYTES_PER_BUILT_SPAN = 60, 40
+# Springs across the boundary of two materials end spans, too: so many times the spans where a body has several.
+MIXED_SPANS = 1.5
 # Resolutions to try where a model has no voxel; the last ones take a second.
 _FINER = [2**k for k in range(2, 11)]
-# Making what is shown; then point, normal, colour and force of a point at a frame.
-BYTES_PER_POINT, BYTES_PER_SAMPLE = 145, 36
 # A clip of the stage has at most so many frames, and bytes. It is what memory holds, and what a sudden end of the
 # process costs; for each clip the disk has to confirm four files, which takes some 10 ms each.
 CLIP_FRAMES = 24
 CLIP_BYTES = 64_000_000
-# Splitting a surface by directions makes patches of the faces of jelly cubes, wider by so many points than by faces.
-_PATCH_MARGIN = 0.6
-# Reading a model needs packages, and the mesh itself.
-BYTES_OF_MODELS = 30e6
-BYTES_PER_TRIANGLE = 1000
-# Voxelising sorts where rays through the columns of cells cross the surface, and all that follows works on that.
-BYTES_PER_CROSSING = 150
 # Above this resolution a model is looked at coarsely first, so that one that cannot fit is refused at once.
 LARGE_RESOLUTION = 1024
 
@@ -93,6 +87,8 @@ class BodyPlan:
     """About as many spans of springs as this."""
     point_estimate: int
     """About as many points are shown as this."""
+    skin_count: int
+    """Number of particles on the surface."""
     row_count: int = 0
     """Number of rows along z of vertices of its grid."""
     voxel_count: int = 0
@@ -136,23 +132,17 @@ class Plan:
     @property
     def body_bytes(self) -> dict[str, int]:
         """Estimated share of each body in the peak of memory, bytes by name."""
-        per_particle = BYTES_PER_PARTICLE[self.scene.solver.precision]
-        frames = min(self.scene.frame_count, clip_length(sum(plan.point_estimate for plan in self.bodies)))
-        per_point = BYTES_PER_POINT + BYTES_PER_SAMPLE * frames
-        return {
-            plan.body.name or "": per_particle * plan.particle_count
-            + BYTES_PER_SPAN * plan.span_estimate
-            + BYTES_PER_ROW * plan.row_count
-            + per_point * plan.point_estimate
-            + BYTES_PER_TRIANGLE * plan.triangle_count
-            for plan in self.bodies
-        }
+        return {plan.body.name or "": body_bytes(plan, self.scene, self._samples) for plan in self.bodies}
 
     @property
     def memory_bytes(self) -> int:
         """Estimated peak of memory, bytes."""
-        models = any(plan.triangle_count for plan in self.bodies)
-        return int(BYTES_AT_REST + models * BYTES_OF_MODELS + sum(self.body_bytes.values()))
+        return peak_bytes(self.bodies, self.scene, self._samples)
+
+    @property
+    def _samples(self) -> int:
+        """Frames that memory holds at once."""
+        return min(self.scene.frame_count, clip_length(sum(plan.point_estimate for plan in self.bodies)))
 
 
 def clip_length(point_count: int) -> int:
@@ -217,11 +207,11 @@ def _plan_body(body: AnyBody, scene: Scene, shot: Shot | None) -> BodyPlan:
         build = partial(build_network, body.points, body.springs(), body.rest_lengths)
         springs = sum(map(len, body.springs()))
         shown = 2 * springs + len(body.points)
-        return BodyPlan(body, {body.material: 0}, build, len(body.points), springs, springs, shown)
+        return BodyPlan(body, {body.material: 0}, build, len(body.points), springs, springs, shown, len(body.points))
     if isinstance(body, ClothBody):
         particles = body.particles[0] * body.particles[1]
         build = partial(build_cloth, body.size, body.particles)
-        return BodyPlan(body, {body.material: 0}, build, particles, 6 * particles, 6 * particles, particles)
+        return BodyPlan(body, {body.material: 0}, build, particles, 6 * particles, 6 * particles, particles, particles)
     model, triangles = None, 0
     regions: list[Cells] = []
     if isinstance(body, CubeBody):
@@ -249,19 +239,30 @@ def _plan_body(body: AnyBody, scene: Scene, shot: Shot | None) -> BodyPlan:
         weighted=weighted,
         materials=materials,
     )
-    particles, springs, spans, faces = count_lattice(cells, particles_per_edge=per_edge, materials=materials)
-    spans += YOUNG_SPANS * faces if weighted else 0
+    counts = count_lattice(cells, particles_per_edge=per_edge, materials=materials)
+    surface = {"voxels": counts.sides, "smooth": counts.skin}
     points = {
-        SURFACE: int(faces * (1 + _PATCH_MARGIN / (per_edge - 1)) ** 2)
-        if model is None
-        else len(model.drawing.vertices),
-        SPRINGS: 2 * springs,
-        PARTICLES: particles,
+        SURFACE: len(model.drawing.vertices) if model is not None else surface[scene.output.surface],
+        SPRINGS: 2 * counts.spring_bound,
+        PARTICLES: counts.particles,
     }
     shown = sum(points[name] for name in set(scene.output.show))
     rows = _count_rows(cells, per_edge)
     cubes = {name: part.count for name, part in zip(names, materials, strict=True)}
-    return BodyPlan(body, cubes, build, particles, springs, spans, shown, rows, cells.count, triangles, model)
+    return BodyPlan(
+        body,
+        cubes,
+        build,
+        counts.particles,
+        counts.spring_bound,
+        int(counts.span_estimate * (MIXED_SPANS if len(materials) > 1 else 1)) + YOUNG_SPANS * counts.skin * weighted,
+        shown,
+        counts.skin,
+        rows,
+        cells.count,
+        triangles,
+        model,
+    )
 
 
 def _count_rows(cells: Cells, particles_per_edge: int) -> int:
@@ -348,7 +349,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str, time: float | None = None) 
     # By the divergence theorem.
     volume = abs(float(np.linalg.det(np.asarray(mesh.triangles)).sum())) / 6
     _require_memory(
-        BYTES_AT_REST + BYTES_PER_CROSSING * _count_crossings(mesh, body, closed=closed),
+        PROGRAM_BYTES + BYTES_PER_CROSSING * _count_crossings(mesh, body, closed=closed),
         f"bodies.{body.name}: voxels at resolution {body.resolution:,}",
     )
     if body.resolution > LARGE_RESOLUTION and closed:
@@ -358,9 +359,10 @@ def voxelize_model(body: ModelBody, *, up_axis: str, time: float | None = None) 
             coarse.cells.count * (body.resolution / LOOK_RESOLUTION) ** 3, volume * (body.resolution / largest) ** 3
         )
         _require_memory(
-            BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * count,
+            PROGRAM_BYTES + BYTES_PER_BUILT_PARTICLE * count,
             f"bodies.{body.name}: about {count:,.0f} voxels at resolution {body.resolution:,}",
         )
+    steps.info("voxelising %s at resolution %s", body.file.name, f"{body.resolution:,}")
     grid, notes = voxelize_mesh(
         mesh, body.resolution, method=body.method, keep_thin_parts=body.keep_thin_parts, pieces=body.pieces
     )
@@ -456,8 +458,9 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, Lattice, dict[str, Any]]:
     assert isinstance(body, ModelBody)
     voxelized = voxelize_model(body, up_axis=scene.up_axis)
     grid = voxelized.grid
-    particles, springs, spans, _ = count_lattice(grid.cells)
-    needed = BYTES_AT_REST + BYTES_PER_BUILT_PARTICLE * particles + BYTES_PER_BUILT_SPAN * spans
+    counts = count_lattice(grid.cells)
+    particles, springs = counts.particles, counts.spring_bound
+    needed = PROGRAM_BYTES + BYTES_PER_BUILT_PARTICLE * particles + BYTES_PER_BUILT_SPAN * counts.span_estimate
     needed += BYTES_PER_ROW * _count_rows(grid.cells, 2)
     _require_memory(needed, f"{grid.cells.count:,} voxels, {particles:,} particles and {springs:,} springs")
     lattice = build_lattice(grid.cells, origin=grid.origin, cell_size=grid.cell_size)
@@ -466,7 +469,7 @@ def survey_model(scene: Scene) -> tuple[VoxelGrid, Lattice, dict[str, Any]]:
         lattice,
         {
             "voxels": grid.cells.count,
-            "particles": len(lattice.particles),
+            "particles": lattice.particle_count,
             "springs": lattice.spring_count,
             "pieces": len(grid.piece_sizes),
             "watertight": voxelized.watertight,
@@ -485,12 +488,3 @@ def _require_memory(needed: float, what: str) -> None:
             f"{what} need about {needed / 1e9:.1f} GB of memory, of {available / 1e9:.1f} GB on this machine; "
             "lower the resolution or the particles per edge"
         )
-
-
-def memory_limit() -> float:
-    """Return how much memory this process may use, bytes: that of the machine or of its control group."""
-    limit = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if hasattr(os, "sysconf") else float("inf")
-    group = Path("/sys/fs/cgroup/memory.max")
-    if group.is_file() and (text := group.read_text().strip()).isdigit():
-        limit = min(limit, float(text))
-    return limit

@@ -24,6 +24,7 @@ from .checkpoint import Checkpoint, differences, origin_of, restore_state, scene
 from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
 from .expect import Observer, Outcome
 from .files import locked
+from .memory import COPIED_BYTES, seeks_limits
 from .plan import plan_scene
 from .rundir import (
     CHECKPOINT_NAME,
@@ -46,13 +47,10 @@ from .stage.stagewriter import StageWriter
 from .starts import warn_of_deep_starts
 
 log = logging.getLogger("warpjelly")
+steps = logging.getLogger("warpjelly.steps")
 
 # Frames that were simulated and are not written yet: while one is written, the next but one may be simulated.
 FRAMES_IN_FLIGHT = 2
-# A run warns of a step above the limit where finding the limit takes at most this share of it, or at most as long as
-# evaluating the forces of so many springs once each, a second or less.
-LIMIT_SHARE = 0.02
-LIMIT_SPRINGS = 100_000_000
 # A run warns of a body that is deeper than this in a collider at the end, in unit cells.
 DEEP_END = 1.0
 # How long a forecast measures, s.
@@ -124,7 +122,9 @@ def simulate(
                 checkpoint = None
             if not (force or resume):
                 refuse_to_replace_run(folder)
+            began = time.perf_counter()
             sim = Simulator(plan_scene(scene), device=device, threads=threads)
+            build_seconds = time.perf_counter() - began
             warn_of_deep_starts(sim)
             _warn_of_long_steps(sim)
             if not existed:
@@ -132,7 +132,7 @@ def simulate(
                 held.enter_context(locked(folder))
                 # Another process may have come first.
                 refuse_to_replace_run(folder)
-            return _simulate_into(folder, sim, checkpoint, progress)
+            return _simulate_into(folder, sim, build_seconds, checkpoint, progress)
     except OSError as error:
         raise EnvironmentFailedError(f"{folder}: cannot write the run: {error.strerror or error}") from error
 
@@ -153,7 +153,11 @@ def _finished_run(folder: Path, scene: Scene) -> Run | None:
 
 
 def _simulate_into(
-    folder: Path, sim: Simulator, checkpoint: Checkpoint | None, progress: Callable[[int, int], None]
+    folder: Path,
+    sim: Simulator,
+    build_seconds: float,
+    checkpoint: Checkpoint | None,
+    progress: Callable[[int, int], None],
 ) -> Run:
     """Simulate the frames that a run directory lacks."""
     scene, rest = sim.scene, sim.shapes()
@@ -214,6 +218,7 @@ def _simulate_into(
         "substeps": sim.substeps,
         "dt": sim.dt,
         "precision": scene.solver.precision,
+        "build_seconds": build_seconds,
         "threads": sim.threads,
         "wall_seconds": time.perf_counter() - began,
         "springs_per_second": sim.model.spring_count * forces / stepping if forces else 0.0,
@@ -257,9 +262,14 @@ def _simulate_frames(
                 observer.observe(figures["penetrations"])
                 stopping = interrupted()
                 due = stopping or index + 1 == total or (index + 1 - first) % writer.clip_length == 0
-                changing = _changing_arrays(sim, observer) if due else None
+                # One checkpoint at a time: each may have a copy of the state.
+                if due:
+                    background.join()
+                changing, copied = _changing_arrays(sim, observer) if due else (None, True)
                 row = _metrics_row(index, sim.time, figures)
                 background.submit(recorder.save, index, sim.shapes(), row, changing)
+                if not copied:
+                    background.join()
                 progress(index + 1, total)
                 if stopping and index + 1 < total:
                     return stepping, KeyboardInterrupt()
@@ -271,10 +281,12 @@ def _simulate_frames(
     return stepping, None
 
 
-def _changing_arrays(sim: Simulator, observer: Observer) -> dict[str, np.ndarray]:
-    """Return copies of all that a checkpoint needs besides the stage."""
+def _changing_arrays(sim: Simulator, observer: Observer) -> tuple[dict[str, np.ndarray], bool]:
+    """Return all that a checkpoint needs besides the stage, and whether it is copied: otherwise it changes."""
     parts = {"state": state_arrays(sim), "observer": observer.arrays()}
-    return {f"{owner}.{name}": array for owner, arrays in parts.items() for name, array in arrays.items()}
+    arrays = {f"{owner}.{name}": array for owner, group in parts.items() for name, array in group.items()}
+    copied = sum(array.nbytes for array in arrays.values()) <= COPIED_BYTES
+    return {name: array.copy() for name, array in arrays.items()} if copied else arrays, copied
 
 
 @contextmanager
@@ -320,6 +332,7 @@ def forecast(scene: Scene, *, device: str = "auto", threads: int | None = None) 
     warn_of_deep_starts(sim)
     if broken := sim.broken_limit():
         log.warning("%s", broken)
+    steps.info("measuring how long a frame takes")
     sim.step()
     sim.shapes()
     sim.diagnostics()
@@ -392,10 +405,8 @@ def _metrics_row(index: int, seconds: float, figures: Mapping[str, Any]) -> dict
 
 
 def _warn_of_long_steps(sim: Simulator) -> None:
-    effort = evaluations(sim.model)
-    if effort * sim.model.spring_count > LIMIT_SPRINGS and effort > LIMIT_SHARE * sim.substeps * sim.scene.frame_count:
-        return
-    if broken := sim.broken_limit():
+    steps = sim.substeps * sim.scene.frame_count
+    if seeks_limits(sim.model.spring_count, steps, evaluations(sim.model)) and (broken := sim.broken_limit()):
         log.warning("%s", broken)
 
 

@@ -113,7 +113,7 @@ def shapes_of(body: str, lattice: Lattice, output: Output, model: LoadedModel | 
     if SPRINGS in shown and lattice.spring_count:
         shapes.append(_springs(body, lattice, by_kind=output.spring_colors == "kind"))
     if PARTICLES in shown:
-        everyone = np.arange(len(lattice.particles), dtype=np.int32)
+        everyone = np.arange(lattice.particle_count, dtype=np.int32)
         shapes.append(Shape(body, PARTICLES, *_alone(everyone), width=_PARTICLE_WIDTH * _spring_length(lattice)))
     return shapes
 
@@ -134,7 +134,7 @@ def face_edges(body: str, lattice: Lattice) -> Shape:
 
 def at_rest(shape: Shape, lattice: Lattice) -> ShapeFrame:
     """Return the sample of a shape in the frame of its body at rest, with no velocities and forces."""
-    points = np.einsum("pk,pkc->pc", shape.weights.astype(float), lattice.particles[shape.particles])
+    points = np.einsum("pk,pkc->pc", shape.weights.astype(float), lattice.positions(shape.particles))
     areas = np.repeat(area_vectors(points, shape.counts, shape.corners), shape.counts, axis=0)
     normals = np.zeros((shape.normal_count, 3))
     np.add.at(normals, shape.corners if shape.corner_normals is None else shape.corner_normals, areas)
@@ -162,7 +162,7 @@ def _surface(body: str, lattice: Lattice, surface: str, model: LoadedModel | Non
         return Shape(body, SURFACE, *hung, *polygons, corner_normals=shared_normals(part), model=model)
     if surface == "smooth":
         quads = lattice.surface_quads
-        points = _smoothed(lattice.particles[lattice.surface_particles], quads)
+        points = _smoothed(lattice.positions(lattice.surface_particles), quads)
         hung = embed(lattice, points, _own_cells(lattice, points))
         return Shape(body, SURFACE, *hung, *_as_polygons(quads))
     points, quads = _split_by_direction(lattice)
@@ -190,7 +190,7 @@ def _split_by_direction(lattice: Lattice) -> tuple[np.ndarray, np.ndarray]:
         [face_count, 4].
     """
     quads = lattice.surface_quads
-    outward = area_vectors(lattice.particles[lattice.surface_particles], *_as_polygons(quads))
+    outward = area_vectors(lattice.positions(lattice.surface_particles), *_as_polygons(quads))
     axis = np.abs(outward).argmax(axis=1)
     direction = 2 * axis + (np.take_along_axis(outward, axis[:, None], axis=1)[:, 0] > 0)
     points, split, count = [], np.empty_like(quads), 0

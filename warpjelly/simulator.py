@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import logging
 import math
 from typing import Any
 
@@ -30,6 +31,8 @@ from .stability import (
 )
 from .stepping import MAX_CAPTURED_SUBSTEPS, Stepper, capture_lock
 from .team import available_cores
+
+steps = logging.getLogger("warpjelly.steps")
 
 
 class Simulator:
@@ -176,6 +179,7 @@ class Simulator:
         if self._limits is None:
             if self.substep_count > 0:
                 raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
+            steps.info("finding the largest stable step")
             pairs = bound_spring_pairs(self.model, self.state.x)
             self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self._contact_pairs))
         return self._limits[contacts]

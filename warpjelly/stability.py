@@ -21,7 +21,9 @@ import warp as wp
 from warpjelly.kernels import contacts, fields
 from warpjelly.kernels.turns import Turn
 
+from .memory import LIMIT_EVALUATIONS
 from .model import Model
+from .placing import BLOCK
 from .stepping import launch_spring_forces
 
 INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
@@ -137,12 +139,15 @@ def bound_spring_pairs(model: Model, x: wp.array) -> np.ndarray:
 
 def evaluations(model: Model) -> int:
     """Return how many evaluations of the spring forces take about as long as ``bound_spring_pairs``."""
-    return 60 if _are_equal(_ratios(model)) else 1200
+    return LIMIT_EVALUATIONS if _are_equal(_ratios(model)) else 20 * LIMIT_EVALUATIONS
 
 
 def _ratios(model: Model) -> np.ndarray:
     """Return damping / stiffness of each class of springs that does anything, [count], s."""
-    used = np.unique(model.spans.numpy()[:, 3])
+    # Not all spans at once, as numbers that index take eight bytes.
+    used, labels = np.zeros(len(model.spring_classes), bool), model.spans.numpy()[:, 3]
+    for start in range(0, len(labels), BLOCK):
+        used[labels[start : start + BLOCK]] = True
     k, d = model.spring_classes.numpy().astype(float)[used, 1:].T
     acting = (k > 0.0) | (d > 0.0)
     return _quotient(d[acting], k[acting])
@@ -201,6 +206,8 @@ def magnetic_limits(model: Model, duration: float) -> dict[str, float]:
     starts, factors = table.curve_start.numpy(), np.abs(table.curve_factor.numpy())
     peak = [factors[i:j].max() if j > i else 1.0 for i, j in itertools.pairwise(starts)]
     field = float((strength * peak)[table.kind.numpy() == fields.MAGNETIC].sum())
+    if not field:
+        return dict.fromkeys(INTEGRATORS, MAX_STEP)
     rates = np.abs(model.particle_charge.numpy().astype(float)) * model.particle_inv_mass.numpy()
     if not (w := field * float(rates.max())):
         return dict.fromkeys(INTEGRATORS, MAX_STEP)
@@ -310,18 +317,25 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
     losses = wp.zeros(len(model.spans), dtype=wp.float64, device=device)
     phases = [(Turn(), wp.array([[0, len(model.spans)]], dtype=wp.vec2i, device=device))]
     classes = model.spring_classes.numpy().astype(float)
-    root = np.sqrt(model.particle_inv_mass.numpy().astype(float))
-    start = np.random.default_rng(0).standard_normal(x.shape) * (root > 0.0)
+    root = np.sqrt(model.particle_inv_mass.numpy())
+    # Row by row, here and below: of a large model temporaries of whole arrays would double what it takes.
+    generator = np.random.default_rng(0)
+    start = np.empty(x.shape, root.dtype)
+    for row in start:
+        row[:] = generator.standard_normal(len(row)) * (root > 0.0)
 
     def top_eigenvalue(p: float, q: float) -> float:
         constants = np.stack([classes[:, 0], 0.0 * classes[:, 0], p * classes[:, 1] + q * classes[:, 2]], axis=1)
         table = wp.array(constants, dtype=model.spring_classes.dtype, device=device)
 
         def multiply(vector: np.ndarray) -> np.ndarray:
-            v.assign((root * vector).astype(wp.dtype_to_numpy(model.real)))
+            for number, row in enumerate(vector):
+                v[number].assign(root * row)
             f.zero_()
             launch_spring_forces(model, table, x, v, f, phases=phases, loss_weight=0.0, losses=losses)
-            return -root * f.numpy()
+            product = f.numpy()
+            product *= -root
+            return product
 
         return _lanczos(multiply, start)
 
@@ -334,24 +348,40 @@ def _lanczos(multiply: Callable[[np.ndarray], np.ndarray], start: np.ndarray) ->
     Without reorthogonalisation three vectors are enough: what orthogonality is lost is lost towards eigenvectors that
     have been found, which repeats their eigenvalues and leaves the top one as it is (Paige 1980,
     doi:10.1016/0024-3795(80)90167-6).
+
+    Args:
+        multiply: returns the product with a vector, which is overwritten the next time.
+        start: [rows, count]; vectors are of its precision, their products are summed in float64.
     """
-    if not (norm := float(np.linalg.norm(start))):
+    if not (norm := math.sqrt(_dot(start, start))):
         return 0.0
-    before, now, off = np.zeros_like(start), start / norm, 0.0
+    before, now, off = np.zeros_like(start), start / start.dtype.type(norm), 0.0
     diagonal: list[float] = []
     beside: list[float] = []
     for _ in range(min(LANCZOS_STEPS, int(np.count_nonzero(start)))):
-        ahead = multiply(now)
-        diagonal.append(float(np.vdot(now, ahead)))
-        ahead -= diagonal[-1] * now
-        ahead -= off * before
-        off = float(np.linalg.norm(ahead))
+        product = multiply(now)
+        diagonal.append(_dot(now, product))
+        # The next vector takes the place of the one before.
+        for ahead, middle, image in zip(before, now, product, strict=True):
+            ahead *= -off
+            ahead += image
+            ahead -= diagonal[-1] * middle
+        off = math.sqrt(_dot(before, before))
         # What is left is rounding when the start had no more eigenvectors in it.
         if off <= 1e-6 * max(map(abs, diagonal)):
             break
         beside.append(off)
-        ahead /= off
-        before, now = now, ahead
+        before /= off
+        before, now = now, before
     size = len(diagonal)
     tridiagonal = np.diag(diagonal) + np.diag(beside[: size - 1], 1) + np.diag(beside[: size - 1], -1)
     return float(np.linalg.eigvalsh(tridiagonal)[-1])
+
+
+def _dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Return the product of two vectors, [rows, count], in float64 where they are long."""
+    return math.fsum(
+        float(np.dot(p[start : start + BLOCK], q[start : start + BLOCK]))
+        for p, q in zip(a, b, strict=True)
+        for start in range(0, len(p), BLOCK)
+    )

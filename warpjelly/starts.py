@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import logging
+import math
 
 import numpy as np
 
+from .placing import BLOCK
 from .scene import PlaneCollider
 from .simulator import Simulator
 
@@ -18,10 +20,11 @@ DEEP_START = 0.05
 def warn_of_deep_starts(sim: Simulator) -> None:
     """Warn of each body that starts deep in a collider, behind a plane, or in another body, before the first step."""
     measured = sim.diagnostics()
-    positions = sim.positions
+    x = sim.state.x.numpy()
     planes = [collider for collider in sim.scene.colliders if isinstance(collider, PlaneCollider)]
     for body, depth in zip(sim.model.bodies, measured["penetrations"], strict=True):
-        cuts = [(_cut_depth(plane, positions[body.particles]), plane) for plane in planes]
+        heights = [(*_height_range(plane, x[:, body.particles]), plane) for plane in planes]
+        cuts = [(-least, plane) for least, greatest, plane in heights if least < 0.0 < greatest]
         deepest, plane = max(cuts, key=lambda cut: cut[0], default=(0.0, None))
         if plane is not None and deepest > plane.threshold:
             log.warning(
@@ -31,8 +34,8 @@ def warn_of_deep_starts(sim: Simulator) -> None:
             )
         elif depth > DEEP_START * body.unit:
             log.warning("body '%s' starts %.3g m deep in a collider and will be thrown out of it", body.name, depth)
-        for plane in planes:
-            if _falls_off_the_back(plane, positions[body.particles], sim.scene.gravity_vector):
+        for least, greatest, plane in heights:
+            if least <= greatest < 0.0 < sim.scene.gravity_vector @ plane.frame()[2]:
                 log.warning(
                     "body '%s' starts behind plane '%s', which stops only what comes from the side of its normal: "
                     "turn the normal round to catch the body",
@@ -51,22 +54,16 @@ def warn_of_deep_starts(sim: Simulator) -> None:
         )
 
 
-def _heights(plane: PlaneCollider, points: np.ndarray) -> np.ndarray:
-    """Return the heights in front of a plane of those points [count, 3] that are over its rectangle, m."""
-    tangent, bitangent, normal = plane.frame()
-    local = points - np.array(plane.center)
-    a, b = plane.size
-    return local[(np.abs(local @ tangent) <= a / 2) & (np.abs(local @ bitangent) <= b / 2)] @ normal
+def _height_range(plane: PlaneCollider, x: np.ndarray) -> tuple[float, float]:
+    """Return the least and greatest height in front of a plane of those points [3, count] that are over its rectangle.
 
-
-def _cut_depth(plane: PlaneCollider, points: np.ndarray) -> float:
-    """Return how far points [count, 3] reach behind the rectangle of a plane [m]; 0 if none is in front of it too."""
-    height = _heights(plane, points)
-    return float(-height.min()) if len(height) and height.min() < 0.0 < height.max() else 0.0
-
-
-def _falls_off_the_back(plane: PlaneCollider, points: np.ndarray, gravity: np.ndarray) -> bool:
-    """Say whether points [count, 3] are behind the rectangle of a plane, and gravity [3] pulls them towards it."""
-    _, _, normal = plane.frame()
-    height = _heights(plane, points)
-    return len(height) > 0 and height.max() < 0.0 and float(gravity @ normal) > 0.0
+    Where none is, the least is infinity and the greatest its opposite.
+    """
+    frame = np.array(plane.frame())
+    reach = np.array(plane.size)[:, None] / 2
+    least, greatest = math.inf, -math.inf
+    for start in range(0, x.shape[1], BLOCK):
+        local = frame @ (x[:, start : start + BLOCK] - np.array(plane.center)[:, None])
+        height = local[2, (np.abs(local[:2]) <= reach).all(axis=0)]
+        least, greatest = min(least, height.min(initial=least)), max(greatest, height.max(initial=greatest))
+    return float(least), float(greatest)

@@ -265,13 +265,15 @@ def _format(scene: Scene) -> str:
     grid = _grid(scene, mass)
     lines.append(str(len(grid)))
     # Everything that imports Warp takes a second, which reading a scene need not spend.
-    from .model import place
+    from .placing import place_body
     from .plan import plan_scene
 
     plan = plan_scene(scene).bodies[0]
-    lattice = plan.build()
-    positions, velocities = place(lattice, np.full(len(lattice.particles), mass), plan.body)
-    lines += [_vector(row) for rows in (grid.reshape(-1, 3), positions, velocities) for row in rows]
+    x, v, masses = (np.empty((rows, plan.particle_count)) for rows in (3, 3, 2))
+    place_body(
+        plan.build(), [scene.materials[plan.body.material]], plan.body, x=x, v=v, mass=masses[0], inv_mass=masses[1]
+    )
+    lines += [_vector(row) for rows in (grid.reshape(-1, 3), x.T, v.T) for row in rows]
     return "\n".join(lines) + "\n"
 
 

@@ -82,6 +82,12 @@ SKELETON_LUMPS: tuple[Lump, ...] = (
     ((0.13, 0.4, -0.22), (0.15, 0.06, -0.22), 0.06, 0.055, 0.03),  # hind leg
 )
 
+# The scaffold is what a sparse body is: beams in three directions, one every so often, turned so that no row of cells
+# lies along one.
+SCAFFOLD_PLACES = (-0.4, 0.0, 0.4)  # of beams beside each other, which are one metre long [m]
+SCAFFOLD_WIDTHS = (0.06, 0.064, 0.068)  # of the beams of each direction: no faces coincide [m]
+SCAFFOLD_TURN = (20.0, 30.0, 40.0)  # about x, y, z [degrees]
+
 # The shot is in centimetres, z up, 24 frames a second. A moulded jelly with a cherry in its top stands a little above
 # its plate: outlines from the axis outwards, up and to the axis again, (radius, height) [cm].
 JELLY_RADII = (0.0, 2.6, 5.0, 5.6, 5.4, 5.1, 4.7, 4.2, 3.4, 2.0, 0.0)
@@ -154,6 +160,22 @@ def creature() -> dict[str, Manifold]:
 def skeleton() -> Manifold:
     """Return the bones of the creature where they are in it."""
     return blend(SKELETON_LUMPS)
+
+
+def block() -> Manifold:
+    """Return a solid cube, one metre wide, around the origin."""
+    return Manifold.cube([1.0, 1.0, 1.0], center=True)
+
+
+def scaffold() -> Manifold:
+    """Return crossing beams that fill a tenth of a turned cube."""
+    beams = [
+        Manifold.cube([width, width, 1.0], center=True).translate([x, y, 0.0]).rotate(turn)
+        for width, turn in zip(SCAFFOLD_WIDTHS, ([0, 0, 0], [90, 0, 0], [0, 90, 0]), strict=True)
+        for x in SCAFFOLD_PLACES
+        for y in SCAFFOLD_PLACES
+    ]
+    return Manifold.batch_boolean(beams, OpType.Add).rotate(SCAFFOLD_TURN)
 
 
 def blend(lumps: Iterable[Lump]) -> Manifold:
@@ -347,7 +369,8 @@ def mtl_lines(colors: dict[str, Point]) -> Iterator[str]:
 
 def write_models(folder: Path) -> None:
     """Write every model into `folder`."""
-    models = {make.__name__: {make.__name__: make()} for make in (tree, coupler, skeleton)} | {"creature": creature()}
+    makers = (tree, coupler, skeleton, block, scaffold)
+    models = {make.__name__: {make.__name__: make()} for make in makers} | {"creature": creature()}
     texts = {f"{name}.obj": obj_lines(parts, f"{name}.mtl") for name, parts in models.items()}
     texts["creature.mtl"] = mtl_lines(CREATURE_COLORS)
     texts["dessert.usda"] = shot_lines()
