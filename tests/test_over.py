@@ -441,7 +441,7 @@ class Moments:
 
 
 def test_each_moment_leaves_a_good_stage(tmp_path, short_clips):
-    """Open what a kill would leave at every moment, and go on from each of those at the end."""
+    """Open what a kill would leave at every moment, and go on from those before a checkpoint and at the end."""
     shot, folder = make_shot(tmp_path / "shot.usda"), tmp_path / "run"
     moments = Moments(folder)
     scene = shot_scene(shot, frames=6)
@@ -453,7 +453,8 @@ def test_each_moment_leaves_a_good_stage(tmp_path, short_clips):
     assert {"os.remove geometry.usdc", "os.rmdir clips", "os.rename run.json"} < set(names[ending + 2 :])
     for kept in moments.kept.values():
         assert not (kept / "stage.usda").exists() or good_frames(kept, folder) >= 0
-    for kept in list(moments.kept.values())[ending:]:
+    saves = [number for number, name in enumerate(names) if name == "os.rename checkpoint.npz"]
+    for kept in [list(moments.kept.values())[number] for number in (*saves, *range(ending, len(names)))]:
         simulate(scene, output=kept, device="cpu", resume=True)
         assert_ended_alike(kept, folder)
 
@@ -473,8 +474,8 @@ def test_a_finished_run_goes_on(tmp_path, short_clips):
     assert overridden(open_stage(tmp_path / "clips")) == [SMOOTH, HARD]
 
 
-def test_one_kind_of_run_replaces_the_other(tmp_path):
-    """Leave nothing of a stage of its own when it is replaced by one over a shot, and the other way round."""
+def test_one_kind_of_run_replaces_the_other(tmp_path, capfd):
+    """Leave nothing of a stage of its own when it is replaced by one over a shot, and the other way round, silently."""
     shot = make_shot(tmp_path / "shot.usda")
     alone = shot_scene(shot, output={}, frames=3)
     simulate(shot_scene(shot, frames=3), output=tmp_path / "run", device="cpu")
@@ -482,6 +483,7 @@ def test_one_kind_of_run_replaces_the_other(tmp_path):
     assert files(tmp_path / "run") == ["checkpoint.npz", "metrics.csv", "run.json", "stage.usdc"]
     simulate(shot_scene(shot, frames=3), output=tmp_path / "run", device="cpu", force=True)
     assert files(tmp_path / "run") == FINISHED
+    assert capfd.readouterr().err == ""
 
 
 def test_a_run_goes_over_another(tmp_path):
