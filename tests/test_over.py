@@ -296,7 +296,7 @@ def test_a_picture_shows_the_materials_of_the_shot(run, tmp_path):
 
 
 def test_a_damaged_sample_is_found(run, tmp_path):
-    """Find a point that is no number, and an extent that does not fit, in the override layer."""
+    """Find in the override layer a point, an extent and a path that are not good, and none of the paths of the shot."""
     shutil.copytree(run.parents[1], tmp_path / "copy")
     broken = tmp_path / "copy" / "runs" / "drop"
     layer = Sdf.Layer.FindOrOpen(str(broken / "override.usdc"))
@@ -304,8 +304,16 @@ def test_a_damaged_sample_is_found(run, tmp_path):
     points[0] = (np.nan, 0, 0)
     layer.SetTimeSample(f"{HARD}.points", START, points)
     layer.SetTimeSample(f"{SMOOTH}.extent", START, [(0, 0, 0), (1, 1, 1)])
-    layer.Save()
-    assert stage_problems(broken) == [f"{SMOOTH}: wrong extent at time 1001", f"{HARD}: non-finite points at time 1001"]
+    shot = Sdf.Layer.FindOrOpen(str(shot_of(broken)))
+    for each, asset in ((layer, tmp_path / "mine.pdf"), (shot, tmp_path / "theirs.pdf")):
+        asset.touch()
+        each.customLayerData = {**each.customLayerData, "asset": Sdf.AssetPath(str(asset))}
+        each.Save()
+    assert stage_problems(broken) == [
+        f"override.usdc: absolute asset path {tmp_path / 'mine.pdf'}",
+        f"{SMOOTH}: wrong extent at time 1001",
+        f"{HARD}: non-finite points at time 1001",
+    ]
 
 
 def test_a_body_starts_as_the_shot_has_it_then(tmp_path, caplog):
