@@ -706,6 +706,11 @@ def test_meshes_that_only_look_like_those_are_not(tmp_path):
     counts.Set(counts.Get(), START)
     stage.GetRootLayer().Save()
     assert {shape.prim for shape in Simulator(shot_scene(shot), device="cpu").model.shapes} == {HARD, SMOOTH}
+    # The skeleton is there, but its joints were taken from the mesh.
+    UsdSkel.Root.Define(stage, "/set")
+    stage.GetAttributeAtPath(f"{SMOOTH}.primvars:skel:jointIndices").Block()
+    stage.GetRootLayer().Save()
+    assert len(Simulator(shot_scene(shot), device="cpu").model.shapes) == 2
 
 
 def test_a_mesh_belongs_to_one_body(tmp_path):

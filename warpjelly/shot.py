@@ -131,5 +131,6 @@ class Shot:
 
 def _is_skinned(prim: Usd.Prim) -> bool:
     joints = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(UsdSkel.Tokens.primvarsSkelJointIndices)
-    bound = joints or UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue()
+    # Where the schema of bindings is applied there is an attribute, with or without joints.
+    bound = (joints and joints.HasAuthoredValue()) or UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue()
     return bool(bound and UsdSkel.Root.Find(prim))
