@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +35,7 @@ def make_shot(path: Path, *, moving: bool = False, mirrored: bool = False, left_
     UsdGeom.SetStageMetersPerUnit(stage, UNIT)
     UsdGeom.SetStageUpAxis(stage, "Z")
     stage.SetTimeCodesPerSecond(RATE)
-    stage.SetFramesPerSecond(RATE)
+    stage.SetFramesPerSecond(2 * RATE)
     stage.SetStartTimeCode(START)
     stage.SetEndTimeCode(END)
     stage.GetRootLayer().customLayerData = {"department": "layout"}
@@ -76,6 +77,32 @@ def make_shot(path: Path, *, moving: bool = False, mirrored: bool = False, left_
     camera.AddRotateXOp().Set(80)
     camera.CreateClippingRangeAttr(Gf.Vec2f(1, 10000))
     UsdLux.DistantLight.Define(stage, "/set/sun").CreateIntensityAttr(3)
+    stage.GetRootLayer().Save()
+    return path
+
+
+def refer_to(asset: Path, path: Path) -> Path:
+    """Write a shot that has another one below transforms, by a payload of a variant, slower and later by 7.
+
+    Args:
+        asset: the other one, from ``make_shot``, whose set is at /world/set.
+        path: the file to make, at 30 frames a second from 2010.
+    """
+    stage = Usd.Stage.CreateNew(str(path))
+    UsdGeom.SetStageMetersPerUnit(stage, UNIT)
+    UsdGeom.SetStageUpAxis(stage, "Z")
+    # Which are time codes, too, where nothing else is said.
+    stage.SetFramesPerSecond(30)
+    stage.SetStartTimeCode(2010)
+    UsdGeom.Xform.Define(stage, "/world").AddScaleOp().Set(Gf.Vec3f(1, 2, -1.5))
+    place = UsdGeom.Xform.Define(stage, "/world/set")
+    place.AddRotateXYZOp().Set(Gf.Vec3f(10, 20, 30))
+    variants = place.GetPrim().GetVariantSets().AddVariantSet("version")
+    variants.AddVariant("new")
+    variants.SetVariantSelection("new")
+    with variants.GetVariantEditContext():
+        offset = Sdf.LayerOffset(7, 2)
+        place.GetPrim().GetPayloads().AddPayload(os.path.relpath(asset, path.parent), "/set", offset)
     stage.GetRootLayer().Save()
     return path
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from warpjelly.files import whole_file
+from warpjelly.files import remove_file, whole_file
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders cannot be synced")
 
@@ -36,6 +36,11 @@ def test_a_power_loss_leaves_the_old_file_or_the_new_one(tmp_path: Path, monkeyp
         assert done == []
     assert done == [4, "a.txt", "folder"]
     assert [file.name for file in tmp_path.iterdir()] == ["a.txt"]
+    for _ in range(2):
+        done.clear()
+        remove_file(tmp_path / "a.txt")
+        assert done == ["folder"]
+        assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize(("code", "fails"), [(errno.EINVAL, False), (errno.EIO, True)])

@@ -6,14 +6,15 @@ import hashlib
 import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, UsdSkel, Vt
 from runs import samples_of
 from shots import (
     CORNERS,
@@ -30,17 +31,21 @@ from shots import (
     UNIT,
     box,
     make_shot,
+    refer_to,
     shot_scene,
     shot_tables,
 )
 
 from warpjelly import plan
+from warpjelly.checkpoint import scene_keys
 from warpjelly.errors import InputError
 from warpjelly.previews.preview import render_preview
 from warpjelly.run import forecast, simulate
+from warpjelly.shot import Shot
 from warpjelly.simulator import Simulator
+from warpjelly.stage.layouts import Over
 from warpjelly.stage.pack import pack
-from warpjelly.stage.stagefiles import open_stage, overridden, progress
+from warpjelly.stage.stagefiles import open_stage, overridden, progress, set_progress
 from warpjelly.stage.validate import stage_problems
 
 GRAVITY = np.array([0.0, 0.0, -9.81])
@@ -49,16 +54,20 @@ WRITTEN = {"points", "extent", "primvars:normals", "primvars:normals:indices", "
 FINISHED = ["checkpoint.npz", "metrics.csv", "override.usdc", "run.json", "stage.usda"]
 # So many substeps that a run takes a while, and that small cells are stable.
 SLOW = {"solver__dt": 1e-4}
-# A run like that with short clips in a process of its own: shot, run directory.
+# A run with short clips in a process of its own, killed before its third clip has its name: shot, run directory.
 SCRIPT = """
-import sys
+import os, signal, sys
 from pathlib import Path
 sys.path.insert(0, sys.argv[3])
 from shots import shot_scene
 from warpjelly import plan
 from warpjelly.run import simulate
 plan.CLIP_FRAMES = 4
-simulate(shot_scene(Path(sys.argv[1]), solver__dt=1e-4), output=sys.argv[2], device="cpu", resume=True)
+def kill(event, arguments):
+    if event == "os.rename" and str(arguments[1]).endswith("frames.000008.usdc"):
+        os.kill(os.getpid(), signal.SIGKILL)
+sys.addaudithook(kill)
+simulate(shot_scene(Path(sys.argv[1])), output=sys.argv[2], device="cpu")
 """
 
 
@@ -126,11 +135,52 @@ def test_a_falling_body_is_where_the_motion_takes_it(tmp_path, moving):
             )
 
 
+@pytest.mark.parametrize("reset", [False, True])
+def test_it_does_not_matter_how_a_mesh_comes_into_the_shot(tmp_path, reset):
+    """Find the fall over a mesh behind a variant, a payload and other time codes, and over one that leaves its parent.
+
+    Above it, transforms turn, squeeze and mirror; its points change with time until the simulation starts.
+    """
+    asset = make_shot(tmp_path / "asset.usda", moving=True)
+    stage = Usd.Stage.Open(str(asset))
+    points = UsdGeom.Mesh(stage.GetPrimAtPath(HARD)).GetPointsAttr()
+    for factor, code in ((1.0, START - 10), (2.0, START + 10)):
+        points.Set(Vt.Vec3fArray.FromNumpy(np.float32(np.array(points.Get()) * factor)), code)
+    UsdGeom.Xformable(stage.GetPrimAtPath("/set/rig/inner")).SetResetXformStack(reset)
+    stage.GetRootLayer().Save()
+    shot = refer_to(asset, tmp_path / "shot.usda")
+    scene = shot_scene(shot, frames=4, bodies__0__prim="/world/set/rig", **SLOW)
+    simulate(scene, output=tmp_path / "run", device="cpu")
+    before, after = Usd.Stage.Open(str(shot)), open_stage(tmp_path / "run")
+    assert [str(path) for path in overridden(after)] == [f"/world{SMOOTH}", f"/world{HARD}"]
+    for path in overridden(after):
+        starts = np.array(UsdGeom.Mesh(before.GetPrimAtPath(path)).GetPointsAttr().Get(2010), float)
+        world = np.c_[starts, np.ones(len(starts))] @ world_of(before, str(path), 2010)
+        mesh = UsdGeom.Mesh(after.GetPrimAtPath(path))
+        assert mesh.GetPointsAttr().GetTimeSamples() == [2010, 2010.5, 2011, 2011.5]
+        for frame, code in enumerate(mesh.GetPointsAttr().GetTimeSamples()):
+            moved = np.array(mesh.GetPointsAttr().Get(code), float)
+            found = (np.c_[moved, np.ones(len(moved))] @ world_of(before, str(path), code))[:, :3]
+            drop = fallen(frame, scene.substeps_for(1e-4)) / UNIT
+            # Five roundings, each to half a bit of the greatest coordinate there is.
+            np.testing.assert_allclose(found, world[:, :3] + drop, atol=5 * 2**-24 * np.abs(world).max() * 3**0.5)
+    assert stage_problems(tmp_path / "run") == []
+
+
 @pytest.mark.parametrize("mirrored", [False, True])
 @pytest.mark.parametrize("left_handed", [False, True])
 def test_authored_normals_follow_the_motion(tmp_path, mirrored, left_handed):
     """Find the normals of a hard box outwards in its own space, in the order of its corners, and old ones blocked."""
     shot = make_shot(tmp_path / "shot.usda", mirrored=mirrored, left_handed=left_handed)
+    stage = Usd.Stage.Open(str(shot))
+    # Below a scale that is not even, so that normals do not turn as directions do.
+    UsdGeom.Xformable(stage.GetPrimAtPath(HARD)).AddRotateXYZOp().Set(Gf.Vec3f(30, 40, 50))
+    old = UsdGeom.PrimvarsAPI(stage.GetPrimAtPath(SMOOTH)).CreatePrimvar(
+        "normals", Sdf.ValueTypeNames.Normal3fArray, "vertex"
+    )
+    old.Set([(0, 0, 1)])
+    old.SetIndices([0] * 9)
+    stage.GetRootLayer().Save()
     simulate(shot_scene(shot, frames=3), output=tmp_path / "run", device="cpu")
     stage = open_stage(tmp_path / "run")
     hard, smooth = (UsdGeom.Mesh(stage.GetPrimAtPath(path)) for path in (HARD, SMOOTH))
@@ -142,6 +192,8 @@ def test_authored_normals_follow_the_motion(tmp_path, mirrored, left_handed):
         np.testing.assert_allclose(primvar.ComputeFlattened(code), outward, atol=1e-4)
     # Subdivision makes its own normals, and what moved as the shot said moves no more.
     assert not smooth.GetNormalsAttr().HasAuthoredValue()
+    assert not UsdGeom.PrimvarsAPI(smooth).GetPrimvar("normals").HasValue()
+    assert not smooth.GetPrim().GetAttribute("primvars:normals:indices").HasAuthoredValue()
     assert not hard.GetVelocitiesAttr().HasAuthoredValue()
     assert not hard.GetAccelerationsAttr().HasAuthoredValue()
     assert stage_problems(tmp_path / "run") == []
@@ -244,7 +296,7 @@ def test_a_picture_shows_the_materials_of_the_shot(run, tmp_path):
 
 
 def test_a_damaged_sample_is_found(run, tmp_path):
-    """Find a point that is no number, and an extent that does not fit, in the override layer."""
+    """Find in the override layer a point, an extent and a path that are not good, and none of the paths of the shot."""
     shutil.copytree(run.parents[1], tmp_path / "copy")
     broken = tmp_path / "copy" / "runs" / "drop"
     layer = Sdf.Layer.FindOrOpen(str(broken / "override.usdc"))
@@ -252,11 +304,19 @@ def test_a_damaged_sample_is_found(run, tmp_path):
     points[0] = (np.nan, 0, 0)
     layer.SetTimeSample(f"{HARD}.points", START, points)
     layer.SetTimeSample(f"{SMOOTH}.extent", START, [(0, 0, 0), (1, 1, 1)])
-    layer.Save()
-    assert stage_problems(broken) == [f"{SMOOTH}: wrong extent at time 1001", f"{HARD}: non-finite points at time 1001"]
+    shot = Sdf.Layer.FindOrOpen(str(shot_of(broken)))
+    for each, asset in ((layer, tmp_path / "mine.pdf"), (shot, tmp_path / "theirs.pdf")):
+        asset.touch()
+        each.customLayerData = {**each.customLayerData, "asset": Sdf.AssetPath(str(asset))}
+        each.Save()
+    assert stage_problems(broken) == [
+        f"override.usdc: absolute asset path {tmp_path / 'mine.pdf'}",
+        f"{SMOOTH}: wrong extent at time 1001",
+        f"{HARD}: non-finite points at time 1001",
+    ]
 
 
-def test_a_body_starts_as_the_shot_has_it_then(tmp_path):
+def test_a_body_starts_as_the_shot_has_it_then(tmp_path, caplog):
     """Take points and places at the time code of the start, and samples after the shot's end along."""
     shot = make_shot(tmp_path / "shot.usda", moving=True)
     stage = Usd.Stage.Open(str(shot))
@@ -265,15 +325,71 @@ def test_a_body_starts_as_the_shot_has_it_then(tmp_path):
     attribute.Set(points, START)
     attribute.Set(points * 2, START + 10)
     stage.GetRootLayer().Save()
+    caplog.clear()
+    Simulator(shot_scene(shot), device="cpu")
+    assert "points rest" not in caplog.text
     sim = Simulator(shot_scene(shot, output__start=START + 5), device="cpu")
     [_, sample] = sim.shapes()
     world = world_of(stage, HARD, START + 5)
+    assert "before time code 1006, where the simulation starts, points rest as they are then" in caplog.text
+    assert f"not as the shot moves them: {HARD}\n" in caplog.text
     np.testing.assert_allclose(sample.points, (points * 1.5 @ world[:3, :3] + world[3, :3]) * UNIT, atol=1e-6)
     simulate(shot_scene(shot, output__start=START + 5, frames=20), output=tmp_path / "run", device="cpu")
     stage = open_stage(tmp_path / "run")
     assert (stage.GetStartTimeCode(), stage.GetEndTimeCode()) == (START, END)
     simulate(shot_scene(shot, output__start=START + 5, frames=49), output=tmp_path / "longer", device="cpu")
     assert open_stage(tmp_path / "longer").GetEndTimeCode() == START + 5 + 48 * RATE / FPS
+
+
+def test_a_region_is_where_the_shot_has_it_then(tmp_path):
+    """Read the model of a region at the time code at which the body is read."""
+    shot = make_shot(tmp_path / "shot.usda", moving=True)
+    regions = [{"file": str(shot), "prim": HARD, "material": "stiff"}]
+    found = []
+    for start in (START, END + 50):
+        scene = shot_scene(shot, output__start=start, bodies__0__regions=regions, materials__stiff={})
+        [region] = plan.voxelize_model(scene.bodies[0], up_axis="Z", time=start).regions
+        found.append(region.count)
+    assert found[0] == found[1] > 0
+
+
+def test_paths_in_the_metadata_lead_to_the_same_files(tmp_path, monkeypatch):
+    """Name files from the run directory that the shot names from beside it, and leave names as they are of others."""
+    (tmp_path / "shots").mkdir()
+    shot = make_shot(tmp_path / "shots" / "shot.usda")
+    (tmp_path / "shots" / "aces.ocio").touch()
+    stage = Usd.Stage.Open(str(shot))
+    stage.SetColorConfiguration(Sdf.AssetPath("./aces.ocio"))
+    layer = stage.GetRootLayer()
+    layer.customLayerData = {**layer.customLayerData, "brief": Sdf.AssetPath("./gone.txt")}
+    layer.comment, layer.documentation = "layout", "of the table"
+    layer.Save()
+    root, folder = Sdf.Layer.CreateAnonymous(".usda"), tmp_path / "runs" / "drop"
+    Over(shot_scene(shot), [], folder).set_metadata(root)
+    assert root.pseudoRoot.GetInfo("colorConfiguration").path == "../../shots/aces.ocio"
+    assert root.customLayerData["brief"].path == "./gone.txt"
+    assert (root.comment, root.documentation) == ("", "")
+
+    def refuse(path: Path, start: Path) -> str:
+        raise ValueError("path is on mount 'C:', start on mount 'D:'")
+
+    monkeypatch.setattr(os.path, "relpath", refuse)
+    assert Over(shot_scene(shot), [], folder).under == [str(shot)]
+
+
+def test_a_shot_is_read_anew_and_compared_once(tmp_path, monkeypatch):
+    """See that the file of a shot was replaced, and read it once to compare it, however many bodies are from it."""
+    shot = make_shot(tmp_path / "shot.usda")
+    body = shot_tables(shot)["bodies"][0]
+    scene = shot_scene(shot, bodies=[{**body, "name": Path(prim).name, "prim": prim} for prim in (HARD, SMOOTH)])
+    before = Shot(scene)
+    read = []
+    monkeypatch.setattr(hashlib, "file_digest", lambda file, kind: read.append(file.name) or hashlib.new(kind))
+    keys = scene_keys(scene)
+    assert read == [str(shot)]
+    assert keys["bodies.hard.file"] == keys["bodies.smooth.file"] == keys["output.over"]
+    shot.write_text(shot.read_text().replace("startTimeCode = 1001", "startTimeCode = 1002"))
+    assert (before.start, Shot(scene).start) == (START, START + 1)
 
 
 @pytest.fixture
@@ -283,27 +399,72 @@ def short_clips(monkeypatch):
 
 
 def test_a_killed_run_goes_on_as_if_nothing_had_been(tmp_path, short_clips):
-    """Kill a run after its first and its fourth clip, find only good samples each time, and in the end the same."""
+    """Kill a run after its second clip, find only good samples, and in the end the same."""
     shot = make_shot(tmp_path / "shot.usda", moving=True)
-    simulate(shot_scene(shot, **SLOW), output=tmp_path / "whole", device="cpu")
-    whole, folder = samples_of(tmp_path / "whole"), tmp_path / "run"
+    simulate(shot_scene(shot), output=tmp_path / "whole", device="cpu")
+    folder = tmp_path / "run"
     command = [sys.executable, "-c", SCRIPT, str(shot), str(folder), str(Path(__file__).parent)]
-    for clips in (1, 4):
-        process = subprocess.Popen(command, stderr=subprocess.PIPE)
-        while process.poll() is None and not (folder / "clips" / f"frames.{4 * clips:06d}.usdc").exists():
-            time.sleep(0.001)
-        process.kill()
-        process.communicate()
-        assert stage_problems(folder) == []
-        frames, total = progress(open_stage(folder)) or (0, 0)
-        assert 4 * clips <= frames < total == FRAMES
-        moved = {key: value for key, value in samples_of(folder).items() if "/rig/" in key[0]}
-        last = START + (frames - 1) * RATE / FPS
-        assert moved == {key: value for key, value in whole.items() if "/rig/" in key[0] and key[1] <= last}
-    simulate(shot_scene(shot, **SLOW), output=folder, device="cpu", resume=True)
-    assert samples_of(folder) == whole
+    assert subprocess.run(command, stderr=subprocess.PIPE, check=False).returncode == -signal.SIGKILL
+    assert good_frames(folder, tmp_path / "whole") == 8
+    simulate(shot_scene(shot), output=folder, device="cpu", resume=True)
+    assert_ended_alike(folder, tmp_path / "whole")
+
+
+def good_frames(folder: Path, whole: Path) -> int:
+    """Return how many frames an unfinished run has, all of whose samples are those of a whole one."""
+    assert stage_problems(folder) == []
+    frames, _ = progress(open_stage(folder)) or (FRAMES, FRAMES)
+    moved = {key: value for key, value in samples_of(folder).items() if "/rig/" in key[0]}
+    last = START + (frames - 1) * RATE / FPS
+    assert moved == {key: value for key, value in samples_of(whole).items() if "/rig/" in key[0] and key[1] <= last}
+    return frames
+
+
+def assert_ended_alike(folder: Path, whole: Path) -> None:
+    """Expect all that a whole run leaves, and nothing else."""
+    assert samples_of(folder) == samples_of(whole)
     assert files(folder) == FINISHED
-    assert (folder / "stage.usda").read_bytes() == (tmp_path / "whole" / "stage.usda").read_bytes()
+    assert (folder / "stage.usda").read_bytes() == (whole / "stage.usda").read_bytes()
+
+
+class Moments:
+    """What is in a folder before each file in it gets its name or goes: what a kill would leave then."""
+
+    def __init__(self, folder: Path) -> None:
+        self.kept: dict[str, Path] = {}
+        self._folder: Path | None = folder
+        sys.addaudithook(self._keep)
+
+    def stop(self) -> None:
+        """Keep no more."""
+        self._folder = None
+
+    def _keep(self, event: str, arguments: tuple[Any, ...]) -> None:
+        if event not in ("os.rename", "os.remove", "os.rmdir") or (folder := self._folder) is None:
+            return
+        path = Path(os.fsdecode(arguments[1 if event == "os.rename" else 0]))
+        if (folder in path.parents or not path.is_absolute()) and ".tmp" not in path.name:
+            what = f"{len(self.kept):02d} {event} {path.name}"
+            self.kept[what] = shutil.copytree(folder, folder.with_name(what))
+
+
+def test_each_moment_leaves_a_good_stage(tmp_path, short_clips):
+    """Open what a kill would leave at every moment, and go on from those before a checkpoint and at the end."""
+    shot, folder = make_shot(tmp_path / "shot.usda"), tmp_path / "run"
+    moments = Moments(folder)
+    scene = shot_scene(shot, frames=6)
+    simulate(scene, output=folder, device="cpu")
+    moments.stop()
+    names = [what.partition(" ")[2] for what in moments.kept]
+    ending = names.index("os.rename override.usdc")
+    assert names[ending : ending + 2] == ["os.rename override.usdc", "os.rename stage.usda"]
+    assert {"os.remove geometry.usdc", "os.rmdir clips", "os.rename run.json"} < set(names[ending + 2 :])
+    for kept in moments.kept.values():
+        assert not (kept / "stage.usda").exists() or good_frames(kept, folder) >= 0
+    saves = [number for number, name in enumerate(names) if name == "os.rename checkpoint.npz"]
+    for kept in [list(moments.kept.values())[number] for number in (*saves, *range(ending, len(names)))]:
+        simulate(scene, output=kept, device="cpu", resume=True)
+        assert_ended_alike(kept, folder)
 
 
 def test_a_finished_run_goes_on(tmp_path, short_clips):
@@ -321,8 +482,8 @@ def test_a_finished_run_goes_on(tmp_path, short_clips):
     assert overridden(open_stage(tmp_path / "clips")) == [SMOOTH, HARD]
 
 
-def test_one_kind_of_run_replaces_the_other(tmp_path):
-    """Leave nothing of a stage of its own when it is replaced by one over a shot, and the other way round."""
+def test_one_kind_of_run_replaces_the_other(tmp_path, capfd):
+    """Leave nothing of a stage of its own when it is replaced by one over a shot, and the other way round, silently."""
     shot = make_shot(tmp_path / "shot.usda")
     alone = shot_scene(shot, output={}, frames=3)
     simulate(shot_scene(shot, frames=3), output=tmp_path / "run", device="cpu")
@@ -330,31 +491,51 @@ def test_one_kind_of_run_replaces_the_other(tmp_path):
     assert files(tmp_path / "run") == ["checkpoint.npz", "metrics.csv", "run.json", "stage.usdc"]
     simulate(shot_scene(shot, frames=3), output=tmp_path / "run", device="cpu", force=True)
     assert files(tmp_path / "run") == FINISHED
+    assert capfd.readouterr().err == ""
 
 
 def test_a_run_goes_over_another(tmp_path):
-    """Move one mesh over a run that moved the other, and find both motions and the shot."""
+    """Move one mesh over a run that moved both, in one layer or in clips, and find each as it was moved last."""
     shot = make_shot(tmp_path / "shot.usda")
-    simulate(shot_scene(shot, bodies__0__prim=HARD, **SLOW), output=tmp_path / "first", device="cpu")
-    first = tmp_path / "first" / "stage.usda"
-    simulate(shot_scene(first, bodies__0__prim=SMOOTH, **SLOW), output=tmp_path / "second", device="cpu")
-    before, after = samples_of(tmp_path / "first"), samples_of(tmp_path / "second")
-    moved = {key: value for key, value in before.items() if key[0].startswith(HARD)}
-    assert moved.items() <= after.items()
-    times = [START + frame * RATE / FPS for frame in range(FRAMES)]
-    assert [code for path, code in after if path == f"{SMOOTH}.points"] == times
-    assert stage_problems(tmp_path / "second") == []
+    for layout in ("usdc", "clips"):
+        first, second = tmp_path / f"first {layout}", tmp_path / f"second {layout}"
+        simulate(shot_scene(shot, frames=3, output__format=layout), output=first, device="cpu")
+        root = Sdf.Layer.FindOrOpen(str(first / "stage.usda"))
+        # As while it is going.
+        set_progress(root, 3, 9)
+        root.Save()
+        over = shot_scene(
+            first / "stage.usda",
+            frames=4,
+            output__format=layout,
+            output__start=START + 10,
+            bodies__0__prim=SMOOTH,
+            **SLOW,
+        )
+        simulate(over, output=second, device="cpu")
+        before, after = samples_of(first), samples_of(second)
+        moved = {key: value for key, value in before.items() if key[0].startswith(HARD)}
+        assert moved.items() <= after.items()
+        times = [START + 10 + frame * RATE / FPS for frame in range(4)]
+        assert [code for path, code in after if path == f"{SMOOTH}.points"] == times
+        assert overridden(open_stage(second)) == [SMOOTH]
+        assert progress(open_stage(first)) == (3, 9)
+        assert progress(open_stage(second)) is None
+        assert stage_problems(second) == []
 
 
 @pytest.mark.parametrize("options", [{}, {"force": True}, {"resume": True}])
 def test_a_shot_is_not_replaced(tmp_path, options):
-    """Refuse to write a run into the folder of the shot, whose names the run's own may be."""
-    shot = make_shot(tmp_path / "stage.usda")
-    content = shot.read_bytes()
-    with pytest.raises(InputError, match=r"the shot of output\.over is in this folder; choose another with -o"):
-        simulate(shot_scene(shot), output=tmp_path, device="cpu", **options)
-    assert shot.read_bytes() == content
-    assert os.listdir(tmp_path) == ["stage.usda"]
+    """Refuse to write a run into a folder with a file of the shot, whose names the run's own may be."""
+    folder = tmp_path / "run"
+    (folder / "clips").mkdir(parents=True)
+    below = make_shot(folder / "clips" / "stage.usda")
+    above = refer_to(below, tmp_path / "shot.usda")
+    for shot, prim in ((below, "/set/rig"), (above, "/world/set/rig")):
+        scene = shot_scene(shot, bodies__0__prim=prim)
+        with pytest.raises(InputError, match=r"a file of output\.over is in this folder: .*stage\.usda; choose"):
+            simulate(scene, output=folder, device="cpu", **options)
+    assert (os.listdir(folder), os.listdir(folder / "clips")) == (["clips"], ["stage.usda"])
 
 
 def test_a_bare_shot_will_do(tmp_path):
@@ -389,6 +570,9 @@ def test_check_says_where_it_will_be(tmp_path, caplog):
     }
     json.dumps(figures)
     assert f"the simulation ends at time code {last:g} and the shot at 1015" in caplog.text
+    caplog.clear()
+    plan.plan_scene(shot_scene(tmp_path / "shot.usda", fps=RATE, frames=1 + round(END - START)))
+    assert "the simulation ends" not in caplog.text
 
 
 NETWORK = {"type": "network", "material": "jelly", "points": [[0.0, 0.0, 0.0]]}
@@ -442,6 +626,27 @@ def skin(stage: Usd.Stage) -> None:
     binding.CreateJointIndicesPrimvar(True, 1).Set([0])
 
 
+def blend(stage: Usd.Stage) -> None:
+    """Let the shapes of a character deform a mesh."""
+    UsdSkel.Root.Define(stage, "/set")
+    UsdSkel.BindingAPI.Apply(stage.GetPrimAtPath(SMOOTH)).CreateBlendShapesAttr(["smile"])
+
+
+def stop_time(stage: Usd.Stage) -> None:
+    """Let time stand still."""
+    stage.SetTimeCodesPerSecond(0)
+
+
+def turn_time_round(stage: Usd.Stage) -> None:
+    """Let time run backwards."""
+    stage.SetTimeCodesPerSecond(-24)
+
+
+def begin_never(stage: Usd.Stage) -> None:
+    """Start at no time."""
+    stage.SetStartTimeCode(np.inf)
+
+
 def animate_topology(stage: Usd.Stage) -> None:
     """Give a mesh other polygons later."""
     counts = UsdGeom.Mesh(stage.GetPrimAtPath(SMOOTH)).GetFaceVertexCountsAttr()
@@ -471,6 +676,10 @@ def lose_a_point(stage: Usd.Stage) -> None:
             r"bodies\.rig\.prim: /set/copy/inner/smooth of .* is part of an instance.*instanceable = false",
         ),
         (skin, "/set/rig", rf"{SMOOTH} of .* is deformed by a skeleton.*bake it"),
+        (blend, "/set/rig", rf"{SMOOTH} of .* is deformed by a skeleton"),
+        (stop_time, "/set/rig", r"shot\.usda: timeCodesPerSecond is 0; it must be above 0"),
+        (turn_time_round, "/set/rig", r"shot\.usda: timeCodesPerSecond is -24; it must be above 0"),
+        (begin_never, "/set/rig", r"shot\.usda: startTimeCode is inf; say where to start with output\.start"),
         (animate_topology, "/set/rig", rf"{SMOOTH} of .* changes its polygons with time \(faceVertexCounts\)"),
         (flatten, "/set/rig", rf"{SMOOTH} of .* is made flat by its transform at time code 1006"),
         (lose_a_point, "/set/rig", rf"{SMOOTH} has coordinates that are not finite"),
@@ -485,6 +694,23 @@ def test_meshes_that_cannot_be_written_over_are_refused(tmp_path, change, prim, 
     with pytest.raises(InputError, match=said) as caught:
         Simulator(shot_scene(shot, bodies__0__prim=prim), device="cpu")
     assert "\n" not in str(caught.value)
+
+
+def test_meshes_that_only_look_like_those_are_not(tmp_path):
+    """Take a mesh with joints that no skeleton moves, and polygons that have one sample."""
+    shot = make_shot(tmp_path / "shot.usda")
+    stage = Usd.Stage.Open(str(shot))
+    skin(stage)
+    UsdGeom.Xform.Define(stage, "/set")
+    counts = UsdGeom.Mesh(stage.GetPrimAtPath(HARD)).GetFaceVertexCountsAttr()
+    counts.Set(counts.Get(), START)
+    stage.GetRootLayer().Save()
+    assert {shape.prim for shape in Simulator(shot_scene(shot), device="cpu").model.shapes} == {HARD, SMOOTH}
+    # The skeleton is there, but its joints were taken from the mesh.
+    UsdSkel.Root.Define(stage, "/set")
+    stage.GetAttributeAtPath(f"{SMOOTH}.primvars:skel:jointIndices").Block()
+    stage.GetRootLayer().Save()
+    assert len(Simulator(shot_scene(shot), device="cpu").model.shapes) == 2
 
 
 def test_a_mesh_belongs_to_one_body(tmp_path):

@@ -7,8 +7,9 @@ import json
 import platform
 import zipfile
 from collections import defaultdict
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, fields
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -101,25 +102,29 @@ def restore_state(sim: Simulator, arrays: Mapping[str, np.ndarray]) -> None:
 def scene_keys(scene: Scene) -> dict[str, Any]:
     """Return what a scene says by dotted key, entries of lists by their names; of files, their names and contents."""
     resolved = scene.model_dump(mode="json", exclude_none=True)
-    return dict(_flattened({key: value for key, value in resolved.items() if key not in _FREE_KEYS}))
+    # All bodies from one shot name the same files, which may be large.
+    contents = cache(_contents)
+    return dict(_flattened({key: value for key, value in resolved.items() if key not in _FREE_KEYS}, contents))
 
 
-def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+def _flattened(
+    node: Mapping[str, Any], contents: Callable[[Path], dict[str, str]], prefix: str = ""
+) -> Iterator[tuple[str, Any]]:
     for key, value in node.items():
         if isinstance(value, Mapping):
-            yield from _flattened(value, f"{prefix}{key}.")
+            yield from _flattened(value, contents, f"{prefix}{key}.")
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             named = {str(entry.get("name", number)): entry for number, entry in enumerate(value)}
-            yield from _flattened(named, f"{prefix}{key}.")
+            yield from _flattened(named, contents, f"{prefix}{key}.")
         elif key in ("file", "grid", "over"):
-            for name, content in _contents(Path(value)):
+            for name, content in contents(Path(value)).items():
                 yield f"{prefix}{key}{name}", content
         else:
             yield f"{prefix}{key}", value
 
 
-def _contents(path: Path) -> Iterator[tuple[str, str]]:
-    """Yield (key, content) of a file, whose key is empty, and of files that it names, whose keys are their names."""
+def _contents(path: Path) -> dict[str, str]:
+    """Return the content of a file, whose key is empty, and of files that it names, whose keys are their names."""
     folder, digests = path.parent.resolve(), defaultdict[str, list[str]](list)
     for file in files_of(path):
         # Where a model has moved with all that is beside it, nothing has changed.
@@ -127,8 +132,10 @@ def _contents(path: Path) -> Iterator[tuple[str, str]]:
         name = place.relative_to(folder).as_posix() if place.is_relative_to(folder) else file.name
         with open(file, "rb") as content:
             digests[name].append(hashlib.file_digest(content, "sha256").hexdigest()[:16])
-    for name, found in digests.items():
-        yield "" if name == path.name else f" {name}", f"{name} (SHA-256 {', '.join(found)})"
+    return {
+        "" if name == path.name else f" {name}": f"{name} (SHA-256 {', '.join(found)})"
+        for name, found in digests.items()
+    }
 
 
 def origin_of(device: str) -> dict[str, str]:

@@ -47,6 +47,12 @@ def whole_file(path: Path) -> Iterator[Path]:
             unfinished.unlink(missing_ok=True)
 
 
+def remove_file(path: Path) -> None:
+    """Remove a file, if there is one; it is gone from the disk, too, before anything that is removed afterwards."""
+    path.unlink(missing_ok=True)
+    _sync_names(path.parent)
+
+
 def _sync_names(folder: Path) -> None:
     """Bring the names of the files in a folder to the disk, as far as system and file system can."""
     if sys.platform == "win32":

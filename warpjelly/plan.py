@@ -16,7 +16,7 @@ import numpy as np
 from warpjelly.kernels.lattices import MAX_MATERIALS
 
 from .cells import Cells
-from .errors import SceneError
+from .errors import SceneError, listed
 from .lattice import Lattice, build_lattice, count_lattice
 from .memory import (
     BYTES_PER_BUILT_PARTICLE,
@@ -188,7 +188,7 @@ def _open_shot(scene: Scene) -> Shot | None:
 
 
 def _require_meshes(shot: Shot, plan: Plan) -> None:
-    """Refuse meshes of the shot that cannot be written over, or belong to two bodies."""
+    """Refuse meshes of the shot that cannot be written over, or belong to two bodies; warn of motion that is lost."""
     owners: dict[str, str] = {}
     for body_plan in plan.bodies:
         assert body_plan.model is not None
@@ -199,6 +199,12 @@ def _require_meshes(shot: Shot, plan: Plan) -> None:
                 raise SceneError(f"{shot.path}: {prim.path} has coordinates that are not finite numbers")
             if owners.setdefault(prim.path, body) != body:
                 raise SceneError(f"bodies.{body}.prim: {prim.path} of {shot.path} belongs to '{owners[prim.path]}' too")
+    if stilled := [path for path in owners if shot.moves_before(path)]:
+        log.warning(
+            "%s: before time code %g, where the simulation starts, points rest as they are then, and not as the shot "
+            "moves them: %s",
+            *(shot.path, shot.start, listed(stilled, 3)),
+        )
 
 
 def _plan_body(body: AnyBody, scene: Scene, shot: Shot | None) -> BodyPlan:
@@ -379,7 +385,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str, time: float | None = None) 
     regions = [
         region.grid_cells(grid.cells.shape, grid.origin, grid.cell_size)
         if region.grid is not None
-        else _cells_in_mesh(region, body, model, scale, grid, up_axis)
+        else _cells_in_mesh(region, body, model, scale, grid, up_axis, time)
         for region in body.regions
     ]
     if body.pieces == "largest":
@@ -404,7 +410,13 @@ def _without_lost_pieces(model: LoadedModel, grid: VoxelGrid) -> LoadedModel:
 
 
 def _cells_in_mesh(
-    region: ModelRegion, body: ModelBody, model: LoadedModel, scale: float, grid: VoxelGrid, up_axis: str
+    region: ModelRegion,
+    body: ModelBody,
+    model: LoadedModel,
+    scale: float,
+    grid: VoxelGrid,
+    up_axis: str,
+    time: float | None,
 ) -> Cells:
     """Return the cells of a body's grid whose centres are inside a part of its model or another one.
 
@@ -415,6 +427,7 @@ def _cells_in_mesh(
         scale: metres per unit.
         grid: of the body, in metres.
         up_axis: as for ``voxelize_model``.
+        time: that of the body; other files have no such time, and are read at rest.
 
     Raises:
         InputError: the model cannot be used.
@@ -426,7 +439,8 @@ def _cells_in_mesh(
         what, mesh = f"part '{region.part}' of {body.file}", model.part(str(region.part))
     else:
         what = str(region.file)
-        mesh = load_model(region.file, up_axis=up_axis, prim=region.prim).scaled(scale).mesh
+        then = time if time is not None and region.file.samefile(body.file) else None
+        mesh = load_model(region.file, up_axis=up_axis, prim=region.prim, time=then).scaled(scale).mesh
     corners = np.concatenate([mesh.bounds, [grid.origin, grid.origin + np.array(grid.cells.shape) * grid.cell_size]])
     if (cells := np.ptp(corners, axis=0).max() / grid.cell_size) > MAX_CELLS:
         raise SceneError(

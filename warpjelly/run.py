@@ -26,6 +26,7 @@ from .expect import Observer, Outcome
 from .files import locked
 from .memory import COPIED_BYTES, seeks_limits
 from .plan import plan_scene
+from .readers.companions import files_of
 from .rundir import (
     CHECKPOINT_NAME,
     RECORD_NAME,
@@ -107,8 +108,7 @@ def simulate(
     folder = Path(output) if output is not None else Path("outputs") / scene.name
     if folder.exists() and not folder.is_dir():
         raise EnvironmentFailedError(f"{folder}: cannot write the run: it is a file; choose a folder with -o")
-    if scene.output.over is not None and folder.resolve() in scene.output.over.resolve().parents:
-        raise InputError(f"{folder}: the shot of output.over is in this folder; choose another with -o")
+    _require_no_shot(scene, folder)
     if force and resume:
         raise InputError("--resume goes on with a run, --force replaces it: give one of them")
     try:
@@ -135,6 +135,13 @@ def simulate(
             return _simulate_into(folder, sim, build_seconds, checkpoint, progress)
     except OSError as error:
         raise EnvironmentFailedError(f"{folder}: cannot write the run: {error.strerror or error}") from error
+
+
+def _require_no_shot(scene: Scene, folder: Path) -> None:
+    """Refuse a run directory with a file that the shot is made of: the run could replace it."""
+    for file in files_of(scene.output.over) if scene.output.over is not None else ():
+        if folder.resolve() in file.resolve().parents:
+            raise InputError(f"{folder}: a file of output.over is in this folder: {file}; choose another with -o")
 
 
 def _finished_run(folder: Path, scene: Scene) -> Run | None:

@@ -6,10 +6,11 @@ import math
 from pathlib import Path
 
 import numpy as np
-from pxr import Sdf, Tf, Usd, UsdGeom, UsdSkel, UsdUtils
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdSkel
 
 from .errors import SceneError, reason
 from .scene import ModelBody, Scene
+from .stage.stagefiles import silent_usd
 
 # Transforms that squeeze space by more than this share have no inverse to speak of.
 _LEAST_SQUEEZE = 1e-9
@@ -22,35 +23,37 @@ class Shot:
         scene: names it.
 
     Raises:
-        SceneError: it cannot be read, or has another axis up than the scene.
+        SceneError: it cannot be read, has another axis up than the scene, or a time that does not run.
     """
 
     def __init__(self, scene: Scene) -> None:
         assert scene.output.over is not None
         self.path: Path = scene.output.over
-        # While this lives, USD prints nothing itself; reading the meshes warns of what is missing.
-        silence = UsdUtils.CoalescingDiagnosticDelegate()
+        # Shots are large, and of all but the bodies nothing is needed.
+        prims = [Sdf.Path(str(body.prim)) for body in scene.bodies if isinstance(body, ModelBody) and body.prim]
+        mask = Usd.StagePopulationMask(
+            [prim for prim in prims if prim.IsAbsolutePath() and prim.IsAbsoluteRootOrPrimPath()]
+        )
         try:
-            # Shots are large, and of all but the bodies nothing is needed.
-            prims = [Sdf.Path(str(body.prim)) for body in scene.bodies if isinstance(body, ModelBody) and body.prim]
-            mask = Usd.StagePopulationMask(
-                [prim for prim in prims if prim.IsAbsolutePath() and prim.IsAbsoluteRootOrPrimPath()]
-            )
-            self.stage = Usd.Stage.OpenMasked(str(self.path), mask)
-            # USD shares what it has read of a file within a process, even after the file was replaced.
-            self.stage.Reload()
+            # Reading the meshes warns of what is missing.
+            with silent_usd():
+                self.stage = Usd.Stage.OpenMasked(str(self.path), mask)
+                # USD shares what it has read of a file within a process, even after the file was replaced.
+                self.stage.Reload()
         except Tf.ErrorException as error:
             raise SceneError(f"{self.path}: not a readable USD file: {reason(error)}") from error
-        finally:
-            del silence
         if (up := UsdGeom.GetStageUpAxis(self.stage)) != scene.up_axis:
             raise SceneError(
                 f'up_axis = "{scene.up_axis}": the shot, {self.path}, has {up} up; with output.over both must agree, '
                 "so that a place is the same in both"
             )
+        if not 0 < (rate := self.stage.GetTimeCodesPerSecond()) < math.inf:
+            raise SceneError(f"{self.path}: timeCodesPerSecond is {rate:g}; it must be above 0")
         self._fps = scene.fps
         self.start = self.stage.GetStartTimeCode() if scene.output.start is None else scene.output.start
         """Time code of frame 0."""
+        if not math.isfinite(self.start):
+            raise SceneError(f"{self.path}: startTimeCode is {self.start:g}; say where to start with output.start")
         self.unit = UsdGeom.GetStageMetersPerUnit(self.stage)
         """Metres per unit."""
 
@@ -84,14 +87,16 @@ class Shot:
         return np.diag([self.unit] * 3 + [1.0]) @ np.array(world).T
 
     def moves(self, path: str) -> bool:
-        """Say whether the place of a prim changes with time."""
+        """Say whether the place of a prim may change with time."""
         prim = self.stage.GetPrimAtPath(path)
-        while prim and not prim.IsPseudoRoot():
-            xformable = UsdGeom.Xformable(prim)
-            if xformable and xformable.TransformMightBeTimeVarying():
-                return True
-            prim = Usd.Prim() if xformable and xformable.GetResetXformStack() else prim.GetParent()
-        return False
+        while prim and not (UsdGeom.Xformable(prim) and UsdGeom.Xformable(prim).TransformMightBeTimeVarying()):
+            prim = prim.GetParent()
+        return bool(prim)
+
+    def moves_before(self, path: str) -> bool:
+        """Say whether the points of a mesh have samples before frame 0, which what is written hides."""
+        earlier = Gf.Interval(-math.inf, self.start, False, False)
+        return len(self.mesh(path).GetPointsAttr().GetTimeSamplesInInterval(earlier)) > 0
 
     def require_mesh(self, path: str, body: str, frame_count: int) -> None:
         """Refuse a mesh that cannot be written over.
@@ -126,5 +131,6 @@ class Shot:
 
 def _is_skinned(prim: Usd.Prim) -> bool:
     joints = UsdGeom.PrimvarsAPI(prim).FindPrimvarWithInheritance(UsdSkel.Tokens.primvarsSkelJointIndices)
-    bound = joints or UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue()
+    # Where the schema of bindings is applied there is an attribute, with or without joints.
+    bound = (joints and joints.HasAuthoredValue()) or UsdSkel.BindingAPI(prim).GetBlendShapesAttr().HasAuthoredValue()
     return bool(bound and UsdSkel.Root.Find(prim))

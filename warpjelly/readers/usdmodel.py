@@ -9,11 +9,12 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils
+from pxr import Gf, Sdf, Tf, Usd, UsdGeom, UsdShade
 
 from ..errors import SceneError, listed, reason
 from ..looks import Look
 from ..polygons import MeshPrim, Model, Part, from_polygons, moved, placed
+from ..stage.stagefiles import silent_usd
 from ..stage.usdlooks import read_look
 
 log = logging.getLogger("warpjelly")
@@ -42,17 +43,14 @@ def read_usd(path: Path, prim: str | None = None, *, time: float | None = None) 
     Raises:
         SceneError: the file is broken, there is no such prim, or no mesh below it.
     """
-    # While this lives, USD prints nothing itself.
-    silence = UsdUtils.CoalescingDiagnosticDelegate()
     try:
-        stage = Usd.Stage.Open(str(path))
-        for error in stage.GetCompositionErrors()[:1]:
-            log.warning("%s: the stage is not complete: %s", path, " ".join(str(error).split()))
-        return _StageReader(path, stage, time).read(prim)
+        with silent_usd():
+            stage = Usd.Stage.Open(str(path))
+            for error in stage.GetCompositionErrors()[:1]:
+                log.warning("%s: the stage is not complete: %s", path, " ".join(str(error).split()))
+            return _StageReader(path, stage, time).read(prim)
     except Tf.ErrorException as error:
         raise SceneError(f"{path}: not a readable USD file: {reason(error)}") from error
-    finally:
-        del silence
 
 
 class _StageReader:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 import numpy as np
-from pxr import Sdf, Usd, UsdGeom, Vt
+from pxr import Sdf, Usd, UsdGeom, UsdUtils, Vt
 
 from ..polygons import unit
 from ..scene import Scene
@@ -150,7 +150,7 @@ class Over:
     def __init__(self, scene: Scene, shapes: Sequence[Shape], folder: Path) -> None:
         self.clip_prims = [shape_path(shape) for shape in shapes]
         self._scene, self._shapes = scene, shapes
-        self._shot = Shot(scene)
+        self._folder, self._shot = folder, Shot(scene)
         self.under = [_path_between(folder, self._shot.path)]
         self._moving = {str(path) for path in self.clip_prims if self._shot.moves(str(path))}
 
@@ -168,6 +168,7 @@ class Over:
         for key in shot.ListInfoKeys():
             if key not in _OF_THE_LAYER:
                 layer.pseudoRoot.SetInfo(key, shot.GetInfo(key))
+        UsdUtils.ModifyAssetPaths(layer, self._asset_from_here)
         # Of a run that this one goes over.
         remove_notes(layer)
         # What the shot leaves to defaults is said: a sublayer and its root have the same time only where both say so.
@@ -215,6 +216,11 @@ class Over:
     def restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Take nothing over."""
 
+    def _asset_from_here(self, asset: str) -> str:
+        """Return the path of a file from the run directory, if it is one beside the shot."""
+        file = Path(self._shot.stage.GetRootLayer().ComputeAbsolutePath(asset))
+        return _path_between(self._folder, file) if file.is_file() else asset
+
     def _placed(self, shape: Shape, frame: int, sample: ShapeFrame) -> ShapeFrame:
         """Return what is written of a sample in the space of its mesh at a frame, velocities per second."""
         path = str(shape_path(shape))
@@ -253,7 +259,7 @@ def _turned(vectors: np.ndarray, matrix: np.ndarray) -> np.ndarray:
 def _path_between(folder: Path, file: Path) -> str:
     """Return the path of a file from a folder, as USD has it; whole where there is none from there."""
     try:
-        return Path(os.path.relpath(file, folder.absolute())).as_posix()
+        return Path(os.path.relpath(file, folder)).as_posix()
     except ValueError:
         # On Windows, another drive.
-        return file.as_posix()
+        return file.absolute().as_posix()

@@ -15,7 +15,7 @@ from typing import Any
 from pxr import Ar, Sdf, Tf, Usd, UsdUtils
 
 from ..errors import EnvironmentFailedError, InputError, reason
-from ..files import missing, whole_file
+from ..files import missing, remove_file, whole_file
 from .prims import WORLD
 
 STAGE_NAME = "stage.usdc"
@@ -171,7 +171,7 @@ def active_clips(stage: Usd.Stage) -> list[tuple[float, Path]]:
 
 def remove_stage(folder: Path) -> None:
     """Remove a stage in parts or over a shot from a run directory, the root first, so that it names nothing gone."""
-    (folder / ROOT_NAME).unlink(missing_ok=True)
+    remove_file(folder / ROOT_NAME)
     remove_parts(folder)
     (folder / OVER_NAME).unlink(missing_ok=True)
 

@@ -18,7 +18,7 @@ from pxr import Sdf, Usd
 
 from ..colors import range_in_words
 from ..errors import EnvironmentFailedError, InputError
-from ..files import whole_file
+from ..files import remove_file, whole_file
 from ..plan import clip_length
 from ..scene import Scene
 from ..shapes import Shape, ShapeFrame
@@ -30,7 +30,6 @@ from .stagefiles import (
     CLIPS_NAME,
     GEOMETRY_NAME,
     MANIFEST_NAME,
-    OVER_NAME,
     ROOT_NAME,
     STAGE_NAME,
     active_clips,
@@ -164,14 +163,13 @@ class StageWriter:
             self._layout.define_motion(Usd.Stage.Open(whole), self.saved_count, self._force_range())
             join_clips(whole, clips, self._force_range(), self._folder / whole_name)
         if whole_name == STAGE_NAME:
-            (self._folder / ROOT_NAME).unlink()
+            remove_file(self._folder / ROOT_NAME)
         else:
             self._write_root(finished=True)
+            # Of a run that was replaced.
+            (self._folder / STAGE_NAME).unlink(missing_ok=True)
         if whole_name is not None:
             remove_parts(self._folder)
-        # Of a run that was replaced, or gone on with.
-        for name in {STAGE_NAME, OVER_NAME} - {whole_name}:
-            (self._folder / name).unlink(missing_ok=True)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return copies of what another writer needs besides the files to go on after the last clip."""
