@@ -208,7 +208,7 @@ def test_an_unforeseen_failure_keeps_the_frames(warpjelly, tmp_path, monkeypatch
     monkeypatch.undo()
     code, _, err = warpjelly("run", CUBE, "-o", tmp_path)
     assert code == 2
-    assert "holds a run that did not finish already (stage.usda, metrics.csv, checkpoint.npz)" in one_line(err)
+    assert "holds an unfinished run (stage.usda, metrics.csv, checkpoint.npz)" in one_line(err)
 
 
 def test_an_interrupted_run_keeps_its_frames(warpjelly, tmp_path, monkeypatch):
@@ -704,7 +704,7 @@ def test_a_stage_may_stand_for_its_run_directory(warpjelly, tmp_path, form):
         assert one_line(err).endswith("a scene is a .toml or a .w file, which names models and is not one itself")
     for option in ("--resume", "--force"):
         code, out, err = warpjelly("run", CUBE, "--frames", 4, "-o", stage, "--set", setting, option)
-        assert (code, out) == (4, "")
+        assert (code, out) == (2, "")
         assert one_line(err) == f"error: {stage}: cannot write the run: it is a file; choose a folder with -o"
     assert not (tmp_path / "new").exists()
     assert {file: file.read_bytes() for file in run.rglob("*") if file.is_file()} == before

@@ -10,7 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from warpjelly.files import remove_file, whole_file
+from warpjelly.errors import InputError
+from warpjelly.files import refuse_to_replace, remove_file, whole_file
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="folders cannot be synced")
 
@@ -70,3 +71,10 @@ def test_a_failure_leaves_the_old_file(tmp_path: Path) -> None:
         raise ZeroDivisionError
     assert (tmp_path / "a.txt").read_text() == "old"
     assert len(list(tmp_path.iterdir())) == 1
+
+
+@pytest.mark.parametrize("force", [True, False])
+def test_a_folder_is_not_replaced_by_a_file(tmp_path: Path, force: bool) -> None:
+    """Ask for the name of a file instead of offering ``--force``, which would not help."""
+    with pytest.raises(InputError, match=r"it is a folder; choose the name of a file$"):
+        refuse_to_replace(tmp_path, force=force)

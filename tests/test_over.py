@@ -39,7 +39,9 @@ from shots import (
 from warpjelly import plan
 from warpjelly.checkpoint import scene_keys
 from warpjelly.errors import InputError
+from warpjelly.previews.eye import Eye
 from warpjelly.previews.preview import render_preview
+from warpjelly.previews.shown import shapes_in
 from warpjelly.run import forecast, simulate
 from warpjelly.shot import Shot
 from warpjelly.simulator import Simulator
@@ -539,7 +541,7 @@ def test_a_shot_is_not_replaced(tmp_path, options):
 
 
 def test_a_bare_shot_will_do(tmp_path):
-    """Take what a shot leaves out as USD does: centimetres, y up, 24 time codes a second from 0; miss a camera."""
+    """Take what a shot leaves out as USD does: centimetres, y up, 24 time codes a second from 0; need no camera."""
     stage = Usd.Stage.CreateNew(str(tmp_path / "bare.usda"))
     box(stage, "/box", FACES, (50, 50, 50))
     stage.GetRootLayer().Save()
@@ -551,12 +553,76 @@ def test_a_bare_shot_will_do(tmp_path):
     drop = fallen(5, scene.substeps_for(1e-4), fps=24.0)[2] / 0.01
     np.testing.assert_allclose(moved, [[0, drop, 0]] * 8, atol=2e-5)
     assert stage_problems(tmp_path / "run") == []
-    with pytest.raises(InputError, match="the stage has no camera"):
-        render_preview(tmp_path / "run", tmp_path / "page.html")
-    stage = Usd.Stage.Open(str(tmp_path / "bare.usda"))
-    UsdGeom.Camera.Define(stage, "/camera").AddTranslateOp().Set(Gf.Vec3d(0, 0, 300))
-    stage.GetRootLayer().Save()
     render_preview(tmp_path / "run", tmp_path / "page.html")
+    seen = Eye(open_stage(tmp_path / "run"))
+    for place, code in points:
+        at = np.array(np.frombuffer(place, np.float32).reshape(-1, 3), float)
+        frustum = seen.at(int(code)).frustum
+        assert all(frustum.Intersects(Gf.Vec3d(*point)) for point in at.tolist())
+
+
+def test_a_camera_without_a_focus_looks_at_what_moves(run, tmp_path):
+    """Turn around what is moved, which is in front of the camera: USD's cameras focus on 0 unless told otherwise."""
+    stage = open_stage(run)
+    camera = next(UsdGeom.Camera(prim) for prim in stage.Traverse() if prim.IsA(UsdGeom.Camera))
+    assert camera.GetFocusDistanceAttr().Get() == 0
+    corners = [
+        np.array(UsdGeom.Boundable(prim).ComputeWorldBound(time, "default").ComputeAlignedRange().GetCorner(corner))
+        for prim in map(stage.GetPrimAtPath, (HARD, SMOOTH))
+        for time in range(int(stage.GetStartTimeCode()), int(stage.GetEndTimeCode()) + 1)
+        for corner in (0, 7)
+    ]
+    middle = (np.min(corners, axis=0) + np.max(corners, axis=0)) / 2
+    view = Eye(stage).at(int(START))
+    matrix = np.array(view.transform)
+    assert view.focusDistance == pytest.approx((matrix[3, :3] - middle) @ matrix[2, :3], rel=1e-6)
+    assert view.focusDistance > 100
+
+
+def test_previews_take_what_shots_are_full_of(run, tmp_path, caplog):
+    """Show cards and triangles in their own shape; leave out, and name, what cannot be, but not the hidden."""
+    shutil.copytree(run.parents[1], tmp_path / "copy")
+    copy = tmp_path / "copy" / "runs" / "drop"
+    stage = Usd.Stage.Open(str(shot_of(copy)))
+    for name, counts in (("triangle", [3]), ("card", [4]), ("hidden", [4]), ("proxy", [4]), ("bare", [])):
+        mesh = UsdGeom.Mesh.Define(stage, f"/set/{name}")
+        if counts:
+            mesh.CreatePointsAttr([(0, 0, 0), (1, 0, 0), (1, 0, 1), (0, 0, 1)][: counts[0]])
+            mesh.CreateFaceVertexCountsAttr(counts)
+            mesh.CreateFaceVertexIndicesAttr(list(range(counts[0])))
+    UsdGeom.Imageable(stage.GetPrimAtPath("/set/hidden")).MakeInvisible()
+    UsdGeom.Imageable(stage.GetPrimAtPath("/set/proxy")).CreatePurposeAttr("proxy")
+    hair = UsdGeom.BasisCurves.Define(stage, "/set/hair")
+    hair.CreateCurveVertexCountsAttr([7])
+    hair.CreatePointsAttr([(i, 0, 0) for i in range(7)])
+    UsdGeom.Points.Define(stage, "/set/dust").CreatePointsAttr([(0, 0, 0)])
+    UsdGeom.Cube.Define(stage, "/set/cube")
+    stage.GetRootLayer().Save()
+
+    shown = {str(mesh.GetPath()) for mesh in shapes_in(open_stage(copy), UsdGeom.Mesh)}
+    assert shown == {HARD, SMOOTH, "/set/other", "/set/triangle", "/set/card"}
+    render_preview(copy, tmp_path / "page.html")
+    (said,) = (record.getMessage() for record in caplog.records)
+    assert said.endswith(": /set/bare (Mesh), /set/hair (BasisCurves), /set/dust (Points), 1 more")
+
+
+@pytest.mark.egl
+def test_a_table_keeps_its_material(run, tmp_path):
+    """See a single quad, which in stages of other runs is the floor, in its own green, and as flat as it is."""
+    from PIL import Image
+
+    shutil.copytree(run.parents[1], tmp_path / "copy")
+    copy = tmp_path / "copy" / "runs" / "drop"
+    stage = Usd.Stage.Open(str(shot_of(copy)))
+    table = UsdGeom.Mesh.Define(stage, "/set/table")
+    table.CreatePointsAttr([(-260, -200, 0), (340, -200, 0), (340, 400, 0), (-260, 400, 0)])
+    table.CreateFaceVertexCountsAttr([4])
+    table.CreateFaceVertexIndicesAttr([0, 1, 2, 3])
+    table.CreateDisplayColorAttr([(0, 1, 0)])
+    stage.GetRootLayer().Save()
+    render_preview(copy, tmp_path / "picture.png", frames=[1003], size=(320, 180))
+    pixels = np.array(Image.open(tmp_path / "picture.png")).astype(int)
+    assert ((pixels[..., 1] > 150) & (pixels[..., ::2] < 140).all(axis=2)).sum() > 500
 
 
 def test_check_says_where_it_will_be(tmp_path, caplog):

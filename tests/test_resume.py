@@ -146,7 +146,7 @@ def test_an_interrupted_run_goes_on_as_if_nothing_had_been(tmp_path, whole, numb
     command = [sys.executable, "-m", "warpjelly.cli", "validate", tmp_path]
     said = subprocess.run(command, check=True, capture_output=True, text=True).stdout
     assert said == f"{tmp_path}: sound; the run is not finished: {frames} of 120 frames\n"
-    with pytest.raises(InputError, match=r"a run that did not finish already .*--resume"):
+    with pytest.raises(InputError, match=r"an unfinished run .*--resume"):
         simulate(small_scene(), output=tmp_path, device="cpu")
     run = simulate(small_scene(), output=tmp_path, device="cpu", resume=True)
     assert run.record["resumed_from"] == frames

@@ -15,7 +15,9 @@ LOCK_NAME = "run.lock"
 
 
 def refuse_to_replace(path: Path, *, force: bool) -> None:
-    """Raise InputError where a file is there already, unless it may be replaced."""
+    """Raise InputError where a file is there already, unless it may be replaced, or a folder."""
+    if path.is_dir():
+        raise InputError(f"{path}: it is a folder; choose the name of a file")
     if path.exists() and not force:
         raise InputError(f"{path}: there already; choose another name, or replace it with --force")
 

@@ -100,14 +100,14 @@ def simulate(
         progress: called after each frame with the number of frames done and in all.
 
     Raises:
-        InputError: the scene cannot be built; the directory holds a run and neither ``force`` nor ``resume`` is set, or
-            one of another scene; or another process is writing to it.
+        InputError: the scene cannot be built; the directory is a file, or holds a run and neither ``force`` nor
+            ``resume`` is set, or one of another scene; or another process is writing to it.
         RunEndedError: the simulation diverged or was interrupted; the error has the run up to there.
         EnvironmentFailedError: the run directory cannot be written.
     """
     folder = Path(output) if output is not None else Path("outputs") / scene.name
     if folder.exists() and not folder.is_dir():
-        raise EnvironmentFailedError(f"{folder}: cannot write the run: it is a file; choose a folder with -o")
+        raise InputError(f"{folder}: cannot write the run: it is a file; choose a folder with -o")
     _require_no_shot(scene, folder)
     if force and resume:
         raise InputError("--resume goes on with a run, --force replaces it: give one of them")

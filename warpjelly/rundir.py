@@ -29,12 +29,11 @@ def refuse_to_replace_run(folder: Path) -> None:
     if not found:
         return
     if RECORD_NAME in found and not read_record(folder)["interrupted"]:
-        what, more = "a run", ""
+        what, more = "a run already", ""
     else:
-        what, more = "a run that did not finish", "go on with --resume, "
+        what, more = "an unfinished run", "go on with --resume, "
     raise InputError(
-        f"{folder}: holds {what} already ({', '.join(found)}); {more}replace it with --force, or choose another folder "
-        "with -o"
+        f"{folder}: holds {what} ({', '.join(found)}); {more}replace it with --force, or choose another folder with -o"
     )
 
 

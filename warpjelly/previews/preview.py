@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -16,8 +17,10 @@ from ..stage.validate import stage_problems
 from .captions import captioned
 from .movies import MOVIES, movie_writer
 from .review import review_page
-from .solids import shapes_in
+from .shown import left_out, shapes_in
 from .view import View
+
+log = logging.getLogger("warpjelly")
 
 MIN_SIZE, MAX_SIZE = 16, 8192
 MAX_PIXELS = 100_000_000
@@ -67,6 +70,10 @@ def render_preview(
     # Damage that only shows when values are read would otherwise come as whatever trips over it.
     if problems := stage_problems(source):
         raise InputError(f"{source}: the stage is not sound, so it cannot be shown: {problems[0]}")
+    if missing := left_out(stage):
+        log.warning(
+            "%s: not shown, since previews show meshes with fixed polygons, balls and lines alone: %s", source, missing
+        )
     shown = _chosen_frames(stage, source, frames, every, single=kind == ".png")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)

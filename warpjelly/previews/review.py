@@ -26,8 +26,10 @@ from ..colors import SRGB_TABLE, srgb_from_linear
 from ..errors import InputError
 from ..looks import Texture
 from ..polygons import triangulate
+from .eye import Eye
 from .legends import legend_of
-from .solids import colors_at, diffuse, looks_of, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
+from .shown import is_collider, is_flat, is_floor, shapes_in
+from .solids import colors_at, diffuse, looks_of, room_floor, subset_of_faces, texture_pixels
 
 # More than that, no browser holds.
 MAX_BYTES = 1_000_000_000
@@ -69,7 +71,7 @@ def review_page(
         progress: called after each shape with the number of shapes done and in all.
 
     Raises:
-        InputError: the stage has no camera or nothing to show, or it is too much for a page.
+        InputError: the stage has nothing to show, or it is too much for a page.
     """
     total = sum(len(shape.GetPointsAttr().Get(frames[0]) or ()) for shape in shapes_in(stage, UsdGeom.PointBased))
     if total * len(frames) * _BYTES_PER_POINT > MAX_BYTES:
@@ -125,7 +127,7 @@ def _surfaces(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
             {"count": size, "color": colors[number]}
             for number, size in zip(numbers.tolist(), sizes.tolist(), strict=True)
         ]
-        kind = "floor" if len(counts) == 1 else "surface"
+        kind = "floor" if is_floor(mesh) else "surface"
         yield _Shape(mesh.GetPrim(), kind, points.Get, triangles[order], parts, chosen, smooth)
 
 
@@ -139,7 +141,7 @@ def _split_at_edges(
     """
     normals = UsdGeom.PrimvarsAPI(mesh).GetPrimvar("normals")
     if not normals:
-        return ..., corners, True
+        return ..., corners, not is_flat(mesh)
     if not normals.IsIndexed() or normals.GetInterpolation() != UsdGeom.Tokens.faceVarying:
         return ..., corners, False
     pairs = np.stack([corners, np.array(normals.GetIndices(frame))], axis=1)
@@ -171,7 +173,7 @@ def _lines(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
 def _room_floors(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
     """Yield the bottoms of rooms that are drawn as their edges."""
     for curves in shapes_in(stage, UsdGeom.BasisCurves):
-        if curves.GetDisplayColorPrimvar().GetInterpolation() == UsdGeom.Tokens.constant:
+        if is_collider(curves):
             corners = room_floor(stage, np.array(curves.GetPointsAttr().Get(frame), float).reshape(-1, 3))
             triangles, parts = np.array([[0, 1, 2], [0, 2, 3]]), [{"count": 2, "color": None}]
             yield _Shape(curves.GetPrim(), "floor", partial(_still, corners), triangles, parts)
@@ -263,11 +265,11 @@ def _differences(frames: np.ndarray) -> np.ndarray:
 
 def _camera(stage: Usd.Stage, frame: int) -> dict[str, Any]:
     """Return where the stage's camera is, where it looks, its axes, and the slopes of what it sees."""
-    view = the_camera(stage).GetCamera(frame)
+    view = Eye(stage).at(frame)
     matrix = np.array(view.transform)
     return {
         "position": matrix[3, :3].tolist(),
-        "target": (matrix[3, :3] - matrix[2, :3] * max(view.focusDistance, 1e-3)).tolist(),
+        "target": (matrix[3, :3] - matrix[2, :3] * view.focusDistance).tolist(),
         "axes": matrix[:3, :3].tolist(),
         "slopes": [aperture / (2 * view.focalLength) for aperture in (view.horizontalAperture, view.verticalAperture)],
     }

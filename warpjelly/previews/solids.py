@@ -15,6 +15,7 @@ from ..colors import srgb_from_linear
 from ..errors import InputError
 from ..looks import Texture
 from ..stage.usdlooks import read_look
+from .shown import corner_normals, is_collider, is_flat, is_floor, shapes_in
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -46,19 +47,6 @@ class Drawn:
     """Lines around what is inside."""
 
 
-def shapes_in(stage: Usd.Stage, schema: Any) -> Iterator[Any]:
-    """Yield the prims of a type."""
-    return (schema(prim) for prim in stage.Traverse() if prim.IsA(schema))
-
-
-def the_camera(stage: Usd.Stage) -> UsdGeom.Camera:
-    """Return a stage's first camera."""
-    camera = next(shapes_in(stage, UsdGeom.Camera), None)
-    if camera is None:
-        raise InputError("the stage has no camera")
-    return camera
-
-
 def room_floor(stage: Usd.Stage, points: np.ndarray) -> np.ndarray:
     """Return the corners [4, 3] of the rectangle at the bottom of a room, given points [n, 3] of its edges, m."""
     up = 2 if UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z else 1
@@ -85,10 +73,9 @@ class StageDrawing:
             return surface if (matrix == np.eye(4)).all() else surface.transform(matrix, inplace=False)
 
         for mesh in shapes_in(self._stage, UsdGeom.Mesh):
-            alone = len(mesh.GetFaceVertexCountsAttr().Get(frame)) == 1
             for solid in self._mesh_solids(mesh, frame):
                 surface = placed(mesh, solid.surface)
-                if alone:
+                if is_floor(mesh):
                     drawn.floors.append(surface)
                 else:
                     drawn.solids.append(replace(solid, surface=surface))
@@ -101,7 +88,7 @@ class StageDrawing:
             points = np.array(curves.GetPointsAttr().Get(frame)).reshape(-1, 3)
             lines = placed(curves, self._pyvista.line_segments_from_points(points))
             interpolation = curves.GetDisplayColorPrimvar().GetInterpolation()
-            if interpolation == UsdGeom.Tokens.constant:
+            if is_collider(curves):
                 drawn.rooms.append(lines)
                 continue
             lines["color"] = colors_at(curves, frame, len(points))
@@ -118,24 +105,22 @@ class StageDrawing:
         corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
         subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
         looks = looks_of(mesh, subsets)
-        if not looks:
-            normals = mesh.GetNormalsAttr().Get(frame)
-            by_corner = _by_corner(mesh, "normals", frame)
-            if by_corner is None:
-                by_point = normals if normals is not None and len(normals) == len(points) else None
-                surface = _shaded(_polygons(self._pyvista, points, counts, corners), by_point)
-                _color(surface, colors_at(mesh, frame, len(points)))
-                yield Solid(surface, shows_force=bool(mesh.GetDisplayColorPrimvar().GetTimeSamples()))
-                return
+        normals, flat = corner_normals(mesh, frame), is_flat(mesh)
+        if not (looks or flat) and normals is None:
+            given = mesh.GetNormalsAttr().Get(frame)
+            by_point = given if given is not None and len(given) == len(points) else None
+            surface = _shaded(_polygons(self._pyvista, points, counts, corners), by_point)
+            _color(surface, colors_at(mesh, frame, len(points)))
+            yield Solid(surface, shows_force=bool(mesh.GetDisplayColorPrimvar().GetTimeSamples()))
+            return
         # VTK has normals and texture coordinates for points alone, so every corner becomes one.
         own = subset_of_faces(subsets, len(counts))
         colors, uvs = colors_at(mesh, frame, len(points)), _by_corner(mesh, "st", frame)
-        normals = _by_corner(mesh, "normals", frame)
         for number in np.unique(own).tolist():
             at = np.repeat(own == number, counts)
             value, image = self._look(looks[number]) if number < len(looks) else (None, None)
             chosen, own_corners = corners[at], np.arange(np.count_nonzero(at))
-            if normals is None and not isinstance(value, Texture):
+            if normals is None and not flat and not isinstance(value, Texture):
                 chosen, own_corners = np.unique(chosen, return_inverse=True)
             surface = _polygons(self._pyvista, points[chosen], counts[own == number], own_corners)
             surface = _shaded(surface, None if normals is None else normals[at])

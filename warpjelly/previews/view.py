@@ -12,8 +12,9 @@ import numpy as np
 from pxr import Usd
 
 from ..errors import EnvironmentFailedError, InputError
+from .eye import Eye
 from .floors import BACKGROUND, Floor
-from .solids import Drawn, Solid, StageDrawing, room_floor, the_camera
+from .solids import Drawn, Solid, StageDrawing, room_floor
 
 if TYPE_CHECKING:
     import pyvista as pv
@@ -63,11 +64,11 @@ class View:
             size: width and height, pixels.
 
         Raises:
-            InputError: pyvista is not installed, or the stage has no camera.
+            InputError: pyvista is not installed.
             EnvironmentFailedError: there is no offscreen OpenGL.
         """
         self._pyvista, self._stage, self._size = require_pyvista(), stage, size
-        self._camera = the_camera(stage)
+        self._eye = Eye(stage)
         self._drawing = StageDrawing(self._pyvista, stage)
         self._actors: list[Any] = []
         self._floors: list[Floor] = []
@@ -128,15 +129,15 @@ class View:
         return actor
 
     def _aim(self, frame: int) -> np.ndarray:
-        """Look through the stage's camera; return its axes (right, up, backward) [3, 3]."""
-        view, camera = self._camera.GetCamera(frame), self._plotter.camera
+        """Look through the camera; return its axes (right, up, backward) [3, 3]."""
+        view, camera = self._eye.at(frame), self._plotter.camera
         matrix = np.array(view.transform)
         axes, position = matrix[:3, :3], matrix[3, :3]
         half_width, half_height = (
             aperture / (2 * view.focalLength) for aperture in (view.horizontalAperture, view.verticalAperture)
         )
         camera.position = position
-        camera.focal_point = position - axes[2] * max(view.focusDistance, 1e-3)
+        camera.focal_point = position - axes[2] * view.focusDistance
         camera.up = axes[1]
         # In a picture of another shape, all that the camera sees stays visible.
         width, height = self._size

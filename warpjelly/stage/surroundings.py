@@ -20,7 +20,7 @@ from .prims import (
 
 # The camera has a 50 mm lens and a 36 mm wide 16:9 film back, and looks slightly down from the right. Directions are
 # for Y up.
-_FOCAL_LENGTH, _APERTURE = 50.0, (36.0, 20.25)
+FOCAL_LENGTH, APERTURE = 50.0, (36.0, 20.25)
 _CAMERA_DIRECTION = (0.6, 0.45, 1.0)
 # Share of the frame that the motion may fill, from the centre to the edge.
 _FRAME_FILL = 0.92
@@ -92,25 +92,41 @@ def define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:
             if np.linalg.norm(center - np.clip(center, *bounds)) < collider.radius + diagonal / 2:
                 low = np.minimum(low, center - collider.radius)
                 high = np.maximum(high, center + collider.radius)
-    axes = facing(_CAMERA_DIRECTION, scene)
-    x, y, z = axes @ np.array(list(np.ndindex(2, 2, 2)) * (high - low) + low).T
+    axes = camera_axes(scene.up_axis)
+    position, distance, clipping = framing(axes, np.array([low, high]))
+    camera = UsdGeom.Camera.Define(stage, CAMERA)
+    camera.CreateFocalLengthAttr(FOCAL_LENGTH)
+    camera.CreateHorizontalApertureAttr(APERTURE[0])
+    camera.CreateVerticalApertureAttr(APERTURE[1])
+    camera.CreateFocusDistanceAttr(distance)
+    camera.CreateClippingRangeAttr(Gf.Vec2f(*clipping))
+    camera.MakeMatrixXform().Set(matrix(axes, position))
+
+
+def camera_axes(up_axis: str) -> np.ndarray:
+    """Return the axes (right, up, backward) [3, 3] of the camera that ``framing`` places."""
+    return facing(_CAMERA_DIRECTION, up_axis)
+
+
+def framing(axes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, float, tuple[float, float]]:
+    """Return where a camera sees a whole box, how far away its middle is, and what to clip at.
+
+    Args:
+        axes: of the camera (right, up, backward), [3, 3].
+        bounds: of the box, [2, 3].
+    """
+    x, y, z = axes @ np.array(list(np.ndindex(2, 2, 2)) * (bounds[1] - bounds[0]) + bounds[0]).T
     # In the axes of the camera, a corner is seen from (X, Y, Z) while |x - X| <= s (Z - z), with s the slope of the
     # frustum's sides; the closest place that sees all follows from the outermost corner on each side.
     placed = []
-    for across, aperture in ((x, _APERTURE[0]), (y, _APERTURE[1])):
-        slope = _FRAME_FILL * aperture / (2 * _FOCAL_LENGTH)
+    for across, aperture in ((x, APERTURE[0]), (y, APERTURE[1])):
+        slope = _FRAME_FILL * aperture / (2 * FOCAL_LENGTH)
         right, left = np.max(across + slope * z), np.max(-across + slope * z)
         placed.append(((right - left) / 2, (right + left) / (2 * slope)))
     back = max(placed[0][1], placed[1][1], z.max() + 1e-3)
     distance = back - (z.max() + z.min()) / 2
-
-    camera = UsdGeom.Camera.Define(stage, CAMERA)
-    camera.CreateFocalLengthAttr(_FOCAL_LENGTH)
-    camera.CreateHorizontalApertureAttr(_APERTURE[0])
-    camera.CreateVerticalApertureAttr(_APERTURE[1])
-    camera.CreateFocusDistanceAttr(distance)
-    camera.CreateClippingRangeAttr(Gf.Vec2f(min(distance / 100, (back - z.max()) / 2), distance * 100))
-    camera.MakeMatrixXform().Set(matrix(axes, axes.T @ np.array([placed[0][0], placed[1][0], back])))
+    clipping = (min(distance / 100, (back - z.max()) / 2), distance * 100)
+    return axes.T @ np.array([placed[0][0], placed[1][0], back]), distance, clipping
 
 
 def _diagonal(bounds: np.ndarray) -> float:

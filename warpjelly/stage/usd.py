@@ -252,7 +252,7 @@ def _define_lights(stage: Usd.Stage, scene: Scene) -> None:
         light.CreateAngleAttr(angle)
         # Normalised, the intensity means the same in renderers with and without soft shadows.
         light.CreateNormalizeAttr(True)
-        light.MakeMatrixXform().Set(matrix(facing(direction, scene), np.zeros(3)))
+        light.MakeMatrixXform().Set(matrix(facing(direction, scene.up_axis), np.zeros(3)))
 
 
 def _define_shape(stage: Usd.Stage, shape: Shape, rest: ShapeFrame, scene: Scene) -> UsdGeom.PointBased:
