@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
+import os
 import platform
 import zipfile
 from collections.abc import Iterator, Mapping
@@ -110,15 +112,36 @@ def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
             named = {str(entry.get("name", number)): entry for number, entry in enumerate(value)}
             yield from _flattened(named, f"{prefix}{key}.")
         elif key == "file":
-            digest = hashlib.sha256(Path(value).read_bytes()).hexdigest()
-            yield f"{prefix}{key}", f"{Path(value).name} (SHA-256 {digest[:16]})"
+            path, about = Path(value), os.stat(value)
+            digest = _digest(path, about.st_size, about.st_mtime_ns)
+            yield f"{prefix}{key}", f"{path.name} (SHA-256 {digest[:16]})"
         else:
             yield f"{prefix}{key}", value
 
 
+@functools.lru_cache(maxsize=1000)
+def _digest(path: Path, size: int, time: int) -> str:
+    """Return the SHA-256 of a file; the runs of a batch share models. A file that has changed has another time."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def scene_hash(scene: Scene) -> str:
+    """Return what tells the results of a scene, made by this version, from any others; the name does not matter."""
+    keys = {key: value for key, value in scene_keys(scene).items() if key != "name"}
+    expect = scene.expect.model_dump(mode="json", exclude_none=True)
+    told = {"scene": keys, "frames": scene.frame_count, "expect": expect, "version": version_of("warpjelly")}
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+@functools.cache
+def version_of(package: str) -> str:
+    """Return the version of an installed package; looking for it takes milliseconds."""
+    return metadata.version(package)
+
+
 def origin_of(device: str) -> dict[str, str]:
     """Return what decides the last bits of a result besides the scene."""
-    versions = {name: metadata.version(name) for name in _PACKAGES}
+    versions = {name: version_of(name) for name in _PACKAGES}
     return {"device": device, "machine": platform.machine(), **versions}
 
 

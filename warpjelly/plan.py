@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import logging
 import math
-import os
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from operator import itemgetter
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,6 +18,7 @@ from warpjelly.kernels.lattices import MAX_MATERIALS
 from .cells import Cells
 from .errors import SceneError
 from .lattice import Lattice, build_lattice, count_lattice
+from .machine import memory_limit
 from .network import build_cloth, build_network
 from .scene import (
     MAX_LENGTH,
@@ -449,12 +448,3 @@ def _require_memory(needed: float, what: str) -> None:
             f"{what} need about {needed / 1e9:.1f} GB of memory, of {available / 1e9:.1f} GB on this machine; "
             "lower the resolution or the particles per edge"
         )
-
-
-def memory_limit() -> float:
-    """Return how much memory this process may use, bytes: that of the machine or of its control group."""
-    limit = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if hasattr(os, "sysconf") else float("inf")
-    group = Path("/sys/fs/cgroup/memory.max")
-    if group.is_file() and (text := group.read_text().strip()).isdigit():
-        limit = min(limit, float(text))
-    return limit
