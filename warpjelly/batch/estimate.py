@@ -32,7 +32,8 @@ class Estimator:
         Raises:
             InputError: the scene cannot be built.
         """
-        key = _structure(scene)
+        # Clips of the stage are in memory until they are whole.
+        key = f"{_structure(scene)} {min(scene.frame_count, CLIP_FRAMES)}"
         if key not in self._memory:
             try:
                 self._memory[key] = plan_scene(scene).memory_bytes
@@ -82,7 +83,7 @@ def _structure(scene: Scene) -> str:
     data["soft_contact"] = data["soft_contact"]["mode"]
     for key in ("dt", "steps_per_frame"):
         data["solver"].pop(key)
-    return json.dumps([data, min(scene.frame_count, CLIP_FRAMES)])
+    return json.dumps(data)
 
 
 def estimate(

@@ -6,7 +6,6 @@ import logging
 import os
 import sys
 import time
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -57,10 +56,9 @@ def _perform(job: Job, device: str, resume: bool, progress: Callable[[int, int],
     try:
         simulate(job.scene, output=job.folder, device=device, force=not resume, resume=resume, progress=progress)
     except (Exception, KeyboardInterrupt) as error:
-        if not isinstance(error, WarpjellyError | KeyboardInterrupt):
-            traceback.print_exc()
         why, code = verdict(error)
-        log.log(logging.INFO if code == INTERRUPTED else logging.ERROR, "%s", why)
+        foreseen = isinstance(error, WarpjellyError | KeyboardInterrupt)
+        log.log(logging.INFO if code == INTERRUPTED else logging.ERROR, "%s", why, exc_info=not foreseen)
         return Result(job.name, code, why)
     log.info("finished after %.1f s", time.perf_counter() - began)
     return Result(job.name, 0, None)

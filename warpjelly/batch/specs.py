@@ -123,7 +123,7 @@ def _entries_of_sweep(sweep: Sweep, source: str, overrides: dict[str, Any], fram
         try:
             scene = load_scene(sweep.base, overrides=sweep.overrides(row, overrides), frames=frames)
         except InputError as error:
-            problem = str(error)
+            problem = f"{source}: {error}"
         yield Entry(name, source, scene, problem, row)
 
 

@@ -33,6 +33,7 @@ _DRAWS = ("uniform", "log_uniform", "normal", "integers")
 _SOURCES = ("values", *_RANGES, *_DRAWS)
 _FORMS = "give a list of values, or a table with one of " + ", ".join(_SOURCES)
 
+Whole = Annotated[int, Field(strict=True, ge=-(2**53), le=2**53)]
 Count = Annotated[int, Field(strict=True, ge=1, le=MAX_RUNS)]
 
 
@@ -58,8 +59,8 @@ class Parameter(Table):
     normal: tuple[Number, Positive] | None = Field(
         None, description="`count` random numbers about a mean with a standard deviation"
     )
-    integers: tuple[int, int] | None = Field(
-        None, strict=True, description="`count` random whole numbers from the first to the second, both included"
+    integers: tuple[Whole, Whole] | None = Field(
+        None, description="`count` random whole numbers from the first to the second, both included"
     )
     count: Count | None = Field(
         None, description="number of values; with combine zip as many as the other parameters have unless given"
@@ -290,9 +291,12 @@ def _parts(sweep: Sweep) -> list[_Part]:
     assert sweep.name is not None
     what = f"name = {json.dumps(sweep.name)}"
     try:
-        parts = [_Part(text, field, style or "") for text, field, style, _ in string.Formatter().parse(sweep.name)]
+        pieces = list(string.Formatter().parse(sweep.name))
     except ValueError as error:
         raise InputError(f"{what}: not a text with {{parameter}}s: {error}") from error
+    if converted := next((field for _, field, _, conversion in pieces if conversion), None):
+        raise InputError(f"{what}: {{{converted}}} takes no conversion with !")
+    parts = [_Part(text, field, style or "") for text, field, style, _ in pieces]
     known = [*sweep.vary, "number"]
     for part in parts:
         if part.parameter is not None and part.parameter not in known:
