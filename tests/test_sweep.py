@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from warpjelly.batch.specs import read_specs
+from warpjelly.batch.specs import default_output, read_specs
 from warpjelly.batch.sweep import Sweep, read_sweep, run_names
 from warpjelly.errors import InputError
 from warpjelly.scenefile import load_scene
@@ -229,6 +230,24 @@ def test_sweeps_and_scenes_can_be_made_in_python():
     assert entries[2].scene is scene
     with pytest.raises(InputError, match=r"cannot be called '\.\./x'"):
         read_specs([{"../x": scene}])
+
+
+def test_a_batch_goes_where_its_only_sweep_or_folder_says(tmp_path):
+    """Find the default folder for a sweep, a folder, a scene and two of them."""
+    sweep = write_sweep(tmp_path, "[vary]\n'solver.dt' = [1e-3]")
+    for specs, name in (([sweep], "sweep"), ([tmp_path], tmp_path.name), ([CUBE], "batch"), ([sweep, CUBE], "batch")):
+        assert default_output(specs, read_specs(specs)) == Path("outputs") / name
+
+
+def test_the_sweep_of_the_readme_is_sound(tmp_path):
+    """Read the sweep that the README shows: four heights, three dampings, two rotations, three stiffnesses."""
+    readme = (SCENES.parent / "README.md").read_text()
+    (text,) = re.findall(r"```toml\n(base = .*?)```", readme, re.DOTALL)
+    (tmp_path / "cube.toml").write_text(CUBE.read_text())
+    (tmp_path / "sweep.toml").write_text(text)
+    entries = read_specs([tmp_path / "sweep.toml"])
+    assert len(entries) == 4 * 3 * 2 * 3
+    assert all(entry.problem is None for entry in entries)
 
 
 def test_the_schema_for_editors_is_current():

@@ -148,7 +148,7 @@ def batch(
         typer.Option(
             "-o",
             "--output",
-            help="Folder of the batch, with a run directory for each run; outputs/<name of the SPEC> unless given.",
+            help="Folder of the batch, with a run directory for each run; outputs/<name of the sweep> unless given.",
             show_default=False,
         ),
     ] = None,

@@ -67,7 +67,8 @@ def run_batch(
 
     Args:
         specs: scene files, folders of them, sweep files, ``Sweep``s, or mappings from names to scenes; or one of them.
-        output: the folder of the batch; ``outputs/<name of the only SPEC>`` or ``outputs/batch`` unless given.
+        output: the folder of the batch; ``outputs/<name of the only sweep file or folder>``, or ``outputs/batch``,
+            unless given.
         overrides: values by dotted key of the scene, for all runs.
         frames: number of samples of all runs, as for ``load_scene``.
         workers: how many processes; as many as GPUs or cores unless given.
@@ -87,7 +88,7 @@ def run_batch(
     """
     chosen = _listed(specs)
     entries = read_specs(chosen, overrides=overrides, frames=frames)
-    folder = Path(output) if output is not None else default_output(chosen)
+    folder = Path(output) if output is not None else default_output(chosen, entries)
     if folder.exists() and not folder.is_dir():
         raise EnvironmentFailedError(f"{folder}: cannot write the batch: it is a file; choose a folder with -o")
     engine = engine or LocalEngine(workers=workers, device=device, most=len(entries))

@@ -20,7 +20,7 @@ from .report import count, describe, write_batch
 from .specs import Entry
 
 # The record is written anew at most so often, s.
-RECORD_INTERVAL = 2.0
+RECORD_INTERVAL = 5.0
 # How long a run directory may still be locked by the processes of a batch that was killed, s.
 LOCK_PATIENCE = 10.0
 

@@ -72,10 +72,14 @@ def read_specs(
     return entries
 
 
-def default_output(specs: Sequence[Spec]) -> Path:
-    """Return the folder of a batch that was not told where to go."""
-    only = specs[0] if len(specs) == 1 else None
-    return Path("outputs") / (Path(only).resolve().stem if isinstance(only, str | Path) else "batch")
+def default_output(specs: Sequence[Spec], entries: Sequence[Entry]) -> Path:
+    """Return the folder of a batch that was not told where to go: that of the only sweep file or folder of scenes."""
+    name = "batch"
+    if len(specs) == 1 and isinstance(specs[0], str | Path):
+        path = Path(specs[0]).resolve()
+        # A scene by itself has its run directory there.
+        name = path.name if path.is_dir() else path.stem if entries[0].parameters else name
+    return Path("outputs") / name
 
 
 def _entries_of(spec: Spec, overrides: dict[str, Any], frames: int | None) -> Iterator[Entry]:
