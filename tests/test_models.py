@@ -44,7 +44,7 @@ def test_models_are_what_the_script_makes(tmp_path: Path) -> None:
     """Make the committed models again, byte for byte."""
     runpy.run_path(str(MODELS / "make_models.py"))["write_models"](tmp_path)
     assert {path.name: path.read_bytes() for path in tmp_path.iterdir()} == {
-        path.name: path.read_bytes() for path in MODELS.iterdir() if path.suffix in (".obj", ".mtl")
+        path.name: path.read_bytes() for path in MODELS.iterdir() if path.suffix in (".obj", ".mtl", ".usda")
     }
 
 

@@ -16,6 +16,7 @@ from stages import cube_surface, make_scene, moved_surface, start_stage, write_s
 
 from warpjelly import cli
 from warpjelly.errors import EnvironmentFailedError, InputError
+from warpjelly.previews.preview import render_preview
 from warpjelly.run import simulate
 from warpjelly.scenefile import load_scene
 from warpjelly.stage.pack import pack
@@ -160,6 +161,34 @@ def test_a_place_that_cannot_be_written_is_reported(tmp_path, painted):
         pack(painted / "usdc", tmp_path / "file" / "packed.usdz")
     assert "\n" not in str(caught.value)
     assert [file.name for file in tmp_path.iterdir()] == ["file"]
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "said"),
+    [
+        ("geometry.usdc", Path.unlink, r"not complete: Could not load sublayer @.*geometry\.usdc@"),
+        ("clips/frames.000000.usdc", Path.unlink, r"frames\.000000\.usdc: no such file"),
+        (
+            "clips/frames.000000.usdc",
+            lambda file: file.write_bytes(file.read_bytes()[:900]),
+            r"frames\.000000\.usdc: not a readable USD file: Sdf crate file corrupt",
+        ),
+    ],
+)
+def test_an_incomplete_stage_is_refused(tmp_path, painted, capfd, name, damage, said):
+    """Say in one line, and no other, which part is missing or damaged, whatever looks at the stage; leave nothing."""
+    shutil.copytree(painted / "clips", tmp_path / "run")
+    damage(tmp_path / "run" / name)
+    with pytest.raises(InputError, match=said) as caught:
+        pack(tmp_path / "run", tmp_path / "packed.usdc")
+    assert "\n" not in str(caught.value)
+    assert len(stage_problems(tmp_path / "run")) > 0
+    with pytest.raises(InputError, match="the stage is not sound, so it cannot be shown: ") as caught:
+        render_preview(tmp_path / "run", tmp_path / "page.html")
+    assert "\n" not in str(caught.value)
+    assert [file.name for file in tmp_path.iterdir()] == ["run"]
+    # USD prints by itself what it stumbles over.
+    assert capfd.readouterr().err == ""
 
 
 def test_the_command_packs(tmp_path, painted, monkeypatch, capfd):

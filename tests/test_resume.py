@@ -5,22 +5,27 @@ from __future__ import annotations
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import trimesh
 from runs import CLIP_FRAMES, samples_of, small_scene, start_run
 
 from warpjelly import plan
 from warpjelly.background import Background
-from warpjelly.checkpoint import Checkpoint, load_checkpoint
-from warpjelly.errors import EnvironmentFailedError, InputError
+from warpjelly.checkpoint import Checkpoint, differences, load_checkpoint, scene_keys
+from warpjelly.errors import EnvironmentFailedError, InputError, SceneError
+from warpjelly.readers.companions import files_of
 from warpjelly.run import RunEndedError, simulate
+from warpjelly.scene import Scene
 from warpjelly.stage.stagefiles import open_stage, progress
 from warpjelly.stage.validate import stage_problems
 
@@ -263,6 +268,93 @@ def test_another_model_does_not_go_on(tmp_path):
     assert simulate(moved, output=tmp_path / "out", device="cpu", resume=True).record["resumed_from"] == 3
     with pytest.raises(InputError, match=r'bodies.model_0.file was "box.obj \(SHA-256 .*\)" and is "box.obj \(SHA'):
         simulate(load_scene(scene("b", 2)), output=tmp_path / "out", device="cpu", resume=True)
+
+
+def write_models(folder: Path) -> None:
+    """Write a box in each format that names other files, and those; images as far as they are looked at."""
+    folder.mkdir()
+    box = trimesh.creation.box()
+    for name, data in box.export(file_type="gltf").items():
+        (folder / name.replace("gltf_buffer_", "box data ").replace("model", "box")).write_bytes(
+            data.replace(b"gltf_buffer_", b"box%20data%20")
+        )
+    header = json.loads((folder / "box.gltf").read_text())
+    (folder / "box.gltf").write_text(json.dumps(header | {"images": [{"uri": "gltf.png"}]}))
+    (folder / "box.obj").write_text(f"mtllib box.mtl\n{box.export(file_type='obj', include_normals=False)}")
+    (folder / "box.mtl").write_text("newmtl red\nmap_Kd -s 2 2 2 images\\mtl.png\n")
+    images = b"<library_images><image id='a'><init_from>dae.png</init_from></image></library_images></COLLADA>"
+    (folder / "box.dae").write_bytes(box.export(file_type="dae").replace(b"</COLLADA>", images))
+    usda = "#usda 1.0\n"
+    texture = 'def Shader "s" {\n asset inputs:file = @usd.png@\n}'
+    (folder / "box.usda").write_text(f"{usda}(subLayers = [@sub.usda@])\n{texture}")
+    (folder / "sub.usda").write_text(f'{usda}def Xform "x" (references = @part.usda@</mesh>) {{}}')
+    (folder / "part.usda").write_text(f'{usda}def Mesh "mesh" {{}}')
+    (folder / "images").mkdir()
+    for name in ("gltf.png", "images/mtl.png", "dae.png", "usd.png"):
+        (folder / name).write_bytes(b"\x89PNG")
+    np.savez(folder / "grid.npz", cells=np.ones((2, 2, 2), bool))
+
+
+@pytest.mark.parametrize(
+    ("model", "changed"),
+    [
+        ("box.gltf", ["", " box data 0.bin", " box data 1.bin", " gltf.png"]),
+        ("box.obj", ["", " box.mtl", " images/mtl.png"]),
+        ("box.dae", ["", " dae.png"]),
+        ("box.usda", ["", " part.usda", " sub.usda", " usd.png"]),
+    ],
+)
+def test_all_files_of_a_model_are_compared(tmp_path, model, changed):
+    """Find which file has changed of those that a model is read from, and nothing where all of them have moved."""
+    write_models(tmp_path / "a")
+    shutil.copytree(tmp_path / "a", tmp_path / "b")
+
+    def keys(folder: str) -> dict[str, Any]:
+        region = {"material": "m", "grid": "grid.npz"}
+        body = {"name": "box", "type": "model", "material": "m", "file": model, "resolution": 2, "regions": [region]}
+        data = {"materials": {"m": {}}, "bodies": [body], "frames": 3}
+        return scene_keys(Scene.model_validate(data, context={"folder": tmp_path / folder}))
+
+    before = keys("a")
+    assert before == keys("b")
+    files = {f"bodies.box.file{name}": tmp_path / "b" / (name.strip() or model) for name in changed}
+    files["bodies.box.regions.0.grid"] = tmp_path / "b" / "grid.npz"
+    assert {key for key in before if key.startswith(("bodies.box.file", "bodies.box.regions.0.grid"))} == files.keys()
+    for key, file in files.items():
+        content = file.read_bytes()
+        if file.suffix == ".npz":
+            np.savez(file, cells=np.eye(2, dtype=bool)[None])
+        else:
+            file.write_bytes(content + b" ")
+        assert [said.split(" was ")[0] for said in differences(before, keys("b"))] == [key]
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("model", "content"),
+    [
+        ("a.obj", "mtllib gone.mtl " + 300 * "a"),
+        ("a.obj", "mtllib a\0b"),
+        ("a.gltf", '{"images": [{"uri": "gone.png"}, {"uri": "data:,"}, {"bufferView": 0}], "buffers": [{}]}'),
+        ("a.dae", "<init_from>gone.png</init_from><init_from/>"),
+        ("a.usda", '#usda 1.0\n(subLayers = [@gone.usda@])\ndef Shader "s" {\n asset inputs:file = @gone.png@\n}'),
+        ("a.stl", "no other files"),
+    ],
+)
+def test_missing_files_of_a_model_are_passed_over(tmp_path, capfd, model, content):
+    """Leave what is missing to the reader of the model, which says so, also names that no file can have."""
+    (tmp_path / model).write_text(content)
+    assert files_of(tmp_path / model) == [tmp_path / model]
+    assert capfd.readouterr().err == ""
+
+
+def test_a_broken_model_does_not_go_on(tmp_path):
+    """Say in one line that a model is broken of which nobody knows what it was read from."""
+    write_models(tmp_path / "a")
+    (tmp_path / "a" / "box.gltf").write_text("{")
+    with pytest.raises(SceneError, match=r"box\.gltf: not a sound \.gltf file: ") as caught:
+        files_of(tmp_path / "a" / "box.gltf")
+    assert "\n" not in str(caught.value)
 
 
 def test_other_versions_are_warned_of(tmp_path, caplog):

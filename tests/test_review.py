@@ -7,18 +7,20 @@ import io
 import json
 import re
 import zlib
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from browsers import opened
-from pxr import Sdf, UsdGeom, UsdShade, Vt
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 from stages import cube_surface, make_scene, write_stage
 
 from warpjelly.colors import SRGB_TABLE, srgb_from_linear
 from warpjelly.errors import InputError
 from warpjelly.looks import Look, Texture
+from warpjelly.previews.legends import Legend, legend_of
 from warpjelly.previews.preview import render_preview
 from warpjelly.stage.stagefiles import open_stage
 from warpjelly.stage.usdlooks import define_look
@@ -72,6 +74,20 @@ def test_page_holds_the_stage(tmp_path: Path, color: str) -> None:
     # The volume inside the surface, from its triangles: they are all there and face outwards.
     assert np.sum(np.cross(a, b) * c) / 6 == pytest.approx(np.prod(np.ptp(points[0], axis=0)), rel=1e-3)
     assert floor[1].shape == (1, 4, 3)
+
+
+def test_page_and_pictures_say_what_the_colors_mean(tmp_path: Path) -> None:
+    """Write the range of forces and the colours of springs into the page as legends of pictures have them."""
+    scene = make_scene(output={"force_range": (0.0, 220.0)})
+    path = write_stage(tmp_path / "stage.usdc", scene, frames=2)
+    stage = Usd.Stage.Open(str(path))
+    red = Gf.Vec3d(1.0, 0.0, 0.0)
+    stage.GetDefaultPrim().SetCustomDataByKey("legend:springs", {"bend": red})
+    stage.Save()
+    expected = Legend("0", "220", "force, N", {"bend": [255, 0, 0]})
+    assert legend_of(stage) == expected
+    render_preview(path, tmp_path / "review.html")
+    assert contents(tmp_path / "review.html")[0]["legend"].items() >= asdict(expected).items()
 
 
 def test_page_stays_small(tmp_path: Path) -> None:
@@ -185,4 +201,33 @@ def test_page_plays_from_disk(tmp_path: Path) -> None:
         assert (colorful(page.screenshot()) != views[1]).sum() > 500
         page.keyboard.press("ArrowLeft")
         page.wait_for_function("player.frame === 8")
+        assert complaints == []
+
+
+@pytest.mark.browser
+def test_page_fits_a_phone(tmp_path: Path) -> None:
+    """Leave room for all controls of a narrow window, and zoom with two fingers as far as they part."""
+    render_preview(write_stage(tmp_path / "stage.usdc"), tmp_path / "r.html")
+    with opened(tmp_path / "r.html") as (page, complaints):
+        page.set_viewport_size({"width": 390, "height": 700})
+        page.wait_for_function("byId('time').textContent !== ''")
+        title, tips, scrub = (page.locator(name).bounding_box() for name in ("#title", "#help", "#scrub"))
+        assert title["y"] + title["height"] <= tips["y"]
+        assert scrub["width"] > 200
+        fingers = page.context.new_cdp_session(page)
+
+        def touch(kind: str, *apart: int) -> None:
+            points = [{"x": 195 + side * apart[0], "y": 300, "id": side} for side in (-1, 1)] if apart else []
+            fingers.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+        target, before = page.evaluate("[camera.target, Math.hypot(...camera.offset)]")
+        touch("touchStart", 40)
+        touch("touchMove", 60)
+        touch("touchMove", 80)
+        touch("touchEnd")
+        page.wait_for_function(f"Math.hypot(...camera.offset) < {0.51 * before}")
+        now, distance = page.evaluate("[camera.target, Math.hypot(...camera.offset)]")
+        assert distance == pytest.approx(before / 2)
+        # The fingers move one after the other; with the first one the middle moves by 10 of 700 pixels, and back again.
+        np.testing.assert_allclose(now, target, rtol=0, atol=0.01 * before)
         assert complaints == []

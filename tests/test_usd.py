@@ -8,16 +8,25 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pxr import Gf, Usd, UsdGeom, UsdShade
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade
 from stages import cube_surface, make_scene, moved_surface, start_stage, write_stage
 
-from warpjelly.colors import COLOR_COUNT, LINEAR_TABLE, SRGB_TABLE, color_indices, linear_from_srgb, srgb_from_linear
+from warpjelly.colors import (
+    COLOR_COUNT,
+    LINEAR_TABLE,
+    SRGB_TABLE,
+    color_indices,
+    linear_from_srgb,
+    range_in_words,
+    srgb_from_linear,
+)
 from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.shapes import ShapeFrame
 from warpjelly.stage.histogram import ForceHistogram
-from warpjelly.stage.stagefiles import open_stage, progress
+from warpjelly.stage.stagefiles import find_stage, open_stage, progress
 from warpjelly.stage.validate import stage_problems
 
+FORMS = ["usdc", "clips"]
 FLOORS = {
     "Y": [{"name": "floor", "type": "half_space", "normal": [0.0, 1.0, 0.0]}],
     "Z": [{"name": "floor", "type": "half_space", "normal": [0.0, 0.0, 1.0]}],
@@ -33,6 +42,19 @@ def motion(frames: int = 10, center: tuple[float, float, float] = (0.0, 0.5, 0.0
     """Return the frames that ``write_stage`` writes."""
     mesh = cube_surface(center=center)
     return [moved_surface(mesh, frame) for frame in range(frames)]
+
+
+def write_clips(folder: Path, form: str, **output: object) -> Path:
+    """Write the frames of ``motion`` by way of clips of three, and return the stage, in one file or in parts."""
+    mesh = cube_surface(center=(0.0, 0.5, 0.0))
+    writer = start_stage(folder, [mesh], make_scene(output={"format": form, **output}))
+    for frame in range(10):
+        writer.write_frame(frame, [moved_surface(mesh, frame)])
+        if frame % 3 == 2:
+            writer.flush()
+    assert len(list((folder / "clips").glob("frames.*.usdc"))) == 3
+    writer.finish()
+    return find_stage(folder)
 
 
 def seen(camera: UsdGeom.Camera, points: np.ndarray) -> np.ndarray:
@@ -65,9 +87,29 @@ def test_color_indices_cover_the_table() -> None:
     assert indices.tolist() == [0, 128, 255, 0, 255, 255, 255]
 
 
-def test_points_are_bit_exact_in_another_process(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("force_range", "words"),
+    [
+        ((0.0, 220.0), ("0", "220")),
+        ((9.9e-42, 4.68), ("0", "4.68")),
+        ((0.0, 5.0), ("0", "5")),
+        ((0.25, 12.5), ("0.25", "12.5")),
+        ((217.64, 2204.1), ("218", "2,200")),
+        ((0.000123, 0.0981), ("0.000123", "0.0981")),
+        ((0.0, 999_960.0), ("0", "1e6")),
+        ((1.96e-6, 3e-6), ("1.96e-6", "3e-6")),
+        ((-3.0, 0.001), ("-3", "0")),
+    ],
+)
+def test_forces_are_said_as_people_write_them(force_range: tuple[float, float], words: tuple[str, str]) -> None:
+    """Round to three digits, without exponents of usual numbers, and call next to nothing 0."""
+    assert range_in_words(force_range) == words
+
+
+@pytest.mark.parametrize("form", FORMS)
+def test_points_are_bit_exact_in_another_process(tmp_path: Path, form: str) -> None:
     """Read every array of every frame in a fresh process, bit for bit as written."""
-    path = write_stage(tmp_path / "stage.usdc", make_scene(output={"velocities": True}))
+    path = write_clips(tmp_path, form, velocities=True)
     script = (
         "import sys, numpy as np; from pxr import Usd\n"
         "stage = Usd.Stage.Open(sys.argv[1])\n"
@@ -338,21 +380,42 @@ def test_a_stage_can_be_opened_from_the_start(tmp_path: Path) -> None:
         assert (tmp_path / "stage.usdc").read_bytes() == before
 
 
-def test_between_clips_points_are_interpolated(tmp_path: Path) -> None:
+@pytest.mark.parametrize("form", FORMS)
+def test_between_frames_points_are_interpolated(tmp_path: Path, form: str) -> None:
     """Give the mean of two frames half way between them, also where one ends a clip and the other starts the next."""
-    mesh = cube_surface(center=(0.0, 0.5, 0.0))
-    writer = start_stage(tmp_path, [mesh], make_scene(output={"format": "clips"}))
-    for frame in range(8):
-        writer.write_frame(frame, [moved_surface(mesh, frame)])
-        if frame % 2:
-            writer.flush()
-    writer.finish()
-    stage = open_stage(tmp_path)
+    stage = open_stage(write_clips(tmp_path, form))
     points = surface_of(stage).GetPointsAttr()
-    for t in range(7):
+    for t in range(9):
         middle = (motion()[t].points + motion()[t + 1].points) / 2
         # One float32 rounding each.
         np.testing.assert_allclose(points.Get(t + 0.5), middle, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize(("scale", "offset"), [(1.0, 100.0), (2.0, -3.5), (0.5, 7.25)])
+@pytest.mark.parametrize("form", FORMS)
+def test_a_shot_may_use_the_stage_at_another_time(tmp_path: Path, form: str, scale: float, offset: float) -> None:
+    """Refer to the stage with an offset and a scale of time: frame t is at scale t + offset, to the bit."""
+    path = write_clips(tmp_path / "run", form)
+    shot = Usd.Stage.CreateNew(str(tmp_path / "shot.usda"))
+    shot.SetTimeCodesPerSecond(make_scene().fps)
+    references = shot.DefinePrim("/Set/jelly").GetReferences()
+    references.AddReference(f"./run/{path.name}", layerOffset=Sdf.LayerOffset(offset, scale))
+    shot.Save()
+    shot, stage = Usd.Stage.Open(str(tmp_path / "shot.usda")), open_stage(path)
+    mesh = UsdGeom.Mesh.Get(shot, "/Set/jelly/bodies/cube/surface")
+    indices, own = (UsdGeom.Primvar(one.GetDisplayColorAttr()).GetIndicesAttr() for one in (mesh, surface_of(stage)))
+    assert mesh.GetPointsAttr().GetTimeSamples() == [scale * t + offset for t in range(10)]
+    for t, frame in enumerate(motion()):
+        time = scale * t + offset
+        assert np.array(mesh.GetPointsAttr().Get(time)).tobytes() == frame.points.tobytes()
+        assert np.array(mesh.GetNormalsAttr().Get(time)).tobytes() == frame.normals.tobytes()
+        assert np.array_equal(indices.Get(time), own.Get(t))
+    middle = (motion()[2].points + motion()[3].points) / 2
+    # One float32 rounding each.
+    np.testing.assert_allclose(mesh.GetPointsAttr().Get(scale * 2.5 + offset), middle, rtol=0, atol=2e-7)
+    # Before the first frame and after the last one nothing moves.
+    assert np.array(mesh.GetPointsAttr().Get(offset - 5)).tobytes() == motion()[0].points.tobytes()
+    assert np.array(mesh.GetPointsAttr().Get(scale * 9 + offset + 5)).tobytes() == motion()[9].points.tobytes()
 
 
 def test_colors_of_clips_get_one_range_in_the_end(tmp_path: Path) -> None:
@@ -379,7 +442,7 @@ def test_colors_of_clips_get_one_range_in_the_end(tmp_path: Path) -> None:
         assert stage_problems(tmp_path / form) == []
 
 
-@pytest.mark.parametrize("form", ["clips", "usdc"])
+@pytest.mark.parametrize("form", FORMS)
 def test_forces_are_written_on_request(tmp_path: Path, form: str) -> None:
     """Write the force on each point at every frame where asked for."""
     mesh = cube_surface(center=(0.0, 0.5, 0.0))

@@ -8,6 +8,7 @@ import json
 import os
 import platform
 import zipfile
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields
 from importlib import metadata
@@ -19,6 +20,7 @@ import numpy as np
 from .errors import InputError
 from .files import whole_file
 from .model import State
+from .readers.companions import files_of
 from .scene import Scene
 from .simulator import Simulator
 
@@ -111,18 +113,31 @@ def _flattened(node: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str,
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             named = {str(entry.get("name", number)): entry for number, entry in enumerate(value)}
             yield from _flattened(named, f"{prefix}{key}.")
-        elif key == "file":
-            path, about = Path(value), os.stat(value)
-            digest = _digest(path, about.st_size, about.st_mtime_ns)
-            yield f"{prefix}{key}", f"{path.name} (SHA-256 {digest[:16]})"
+        elif key in ("file", "grid", "over"):
+            for name, content in _contents(Path(value)):
+                yield f"{prefix}{key}{name}", content
         else:
             yield f"{prefix}{key}", value
+
+
+def _contents(path: Path) -> Iterator[tuple[str, str]]:
+    """Yield (key, content) of a file, whose key is empty, and of files that it names, whose keys are their names."""
+    folder, digests = path.parent.resolve(), defaultdict[str, list[str]](list)
+    for file in files_of(path):
+        # Where a model has moved with all that is beside it, nothing has changed.
+        place = file.parent.resolve() / file.name
+        name = place.relative_to(folder).as_posix() if place.is_relative_to(folder) else file.name
+        about = os.stat(file)
+        digests[name].append(_digest(file, about.st_size, about.st_mtime_ns)[:16])
+    for name, found in digests.items():
+        yield "" if name == path.name else f" {name}", f"{name} (SHA-256 {', '.join(found)})"
 
 
 @functools.lru_cache(maxsize=1000)
 def _digest(path: Path, size: int, time: int) -> str:
     """Return the SHA-256 of a file; the runs of a batch share models. A file that has changed has another time."""
-    return hashlib.sha256(path.read_bytes()).hexdigest()
+    with open(path, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 def scene_hash(scene: Scene) -> str:

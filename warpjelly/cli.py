@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from .errors import InputError, SceneError, WarpjellyError, verdict
+from .errors import InputError, SceneError, WarpjellyError, listed, verdict
 
 if TYPE_CHECKING:
     from .expect import Outcome
@@ -266,6 +266,10 @@ def check(
         steps = [f"{step * 1e3:.4g} ms" if step else "none" for step in (limit, figures["dt_limit_in_contact"][name])]
         used = "; used here" if name == loaded.solver.integrator else ""
         print(f"  {name:<19} {steps[0]:>10} is its largest stable step; in contact {steps[1]}{used}")
+    if over := figures["over"]:
+        first, last = over["time_codes"]
+        print(f"  over       {listed(over['meshes'], 3)}")
+        print(f"  shot       {first:>13g} to {last:g}, its time codes")
     print(f"  time       {figures['seconds']:>13.3g} s on {figures['device']}, about, stage included")
 
 
@@ -409,7 +413,8 @@ def preview(
         typer.Option(
             "--frame",
             help="In a picture, a frame to show, repeated for several side by side; the moment of the hardest impact "
-            "unless given. In a movie or page, given twice, the first and the last; all unless given.",
+            "unless given, or the last where no colours show forces. In a movie or page, given twice, the first and "
+            "the last; all unless given.",
             show_default=False,
         ),
     ] = [],  # noqa: B006

@@ -49,6 +49,21 @@ def color_indices(force: np.ndarray, force_range: tuple[float, float]) -> np.nda
     return np.rint(np.fmax(np.fmin(position, COLOR_COUNT - 1), 0)).astype(np.int32)
 
 
+def range_in_words(force_range: tuple[float, float]) -> tuple[str, str]:
+    """Return the forces at both ends of the table as people write them: three digits, and 0 for next to nothing."""
+    low, high = force_range
+    nothing = max(abs(low), abs(high)) / 1000
+    return _number(0.0 if abs(low) < nothing else low), _number(0.0 if abs(high) < nothing else high)
+
+
+def _number(value: float) -> str:
+    rounded = f"{value:.2e}"
+    digits, exponent = rounded.split("e")
+    if -4 <= int(exponent) < 6:
+        return f"{float(rounded):,.6f}".rstrip("0").rstrip(".")
+    return f"{float(digits):g}e{int(exponent)}"
+
+
 # Structural, face shear, body shear and bend springs, told apart by people who see colours differently, too
 # (M. Okabe and K. Ito, Color Universal Design, 2008).
 _KINDS = "0072b2 e69f00 e69f00 009e73"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import sys
 from collections.abc import Iterator
@@ -31,7 +32,8 @@ def whole_file(path: Path) -> Iterator[Path]:
     """Give a temporary name beside a file; what was written there gets the file's name when the block ends well.
 
     The name keeps the extension, from which writers tell the format. The data is on the disk before the file is
-    renamed, so that even a power loss leaves either the old file or the new one. After an exception nothing is left.
+    renamed, and its new name before the block ends, so that even a power loss leaves either the old file or the new
+    one, and nothing that is written afterwards without what came before. After an exception nothing is left.
     """
     unfinished = unfinished_name(path)
     try:
@@ -39,9 +41,26 @@ def whole_file(path: Path) -> Iterator[Path]:
         with unfinished.open("rb") as file:
             os.fsync(file.fileno())
         os.replace(unfinished, path)
+        _sync_names(path.parent)
     finally:
         with suppress(OSError):
             unfinished.unlink(missing_ok=True)
+
+
+def _sync_names(folder: Path) -> None:
+    """Bring the names of the files in a folder to the disk, as far as system and file system can."""
+    if sys.platform == "win32":
+        return
+    try:
+        descriptor = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
+    except OSError as error:
+        # A folder that may not be listed, or a file system without this.
+        if error.errno not in (errno.EACCES, errno.EINVAL, errno.ENOTSUP):
+            raise
 
 
 def unfinished_name(path: Path) -> Path:

@@ -77,6 +77,12 @@ _SIGNATURES = (
 _UNSIGNED = (".tga", ".pic", ".psd")
 
 
+def image_file(model: Path, path: Path) -> Path:
+    """Return the file of an image that a model names: beside the model, where the path belongs to another machine."""
+    folder = model.parent
+    return folder / path if os.path.exists(folder / path) else folder / path.name
+
+
 class Images:
     """The image files that a model names, each of which is read once."""
 
@@ -85,18 +91,14 @@ class Images:
         self._read: dict[str, tuple[str, bytes] | None] = {}
 
     def read(self, name: str) -> tuple[str, bytes] | None:
-        """Return the name of a file without its folder and what is in it; None, after a warning, if that is no image.
-
-        It is looked for beside the model, too, where its path belongs to another machine.
-        """
+        """Return name, without its folder, and content of a file; None, after a warning, if that is no image."""
         if name not in self._read:
             self._read[name] = self._found(Path(name.replace("\\", "/")))
         return self._read[name]
 
     def _found(self, path: Path) -> tuple[str, bytes] | None:
-        folder = self._model.parent
         try:
-            data = (folder / path if os.path.exists(folder / path) else folder / path.name).read_bytes()
+            data = image_file(self._model, path).read_bytes()
             if not (data.startswith(_SIGNATURES) or path.suffix.lower() in _UNSIGNED):
                 log.warning("%s: the texture %s is left out: it is not an image of a known format", self._model, path)
                 return None

@@ -15,7 +15,7 @@ import trimesh
 
 from .errors import SceneError, listed
 from .looks import Look
-from .polygons import Model, Part, from_polygons, joined, placed, triangulate
+from .polygons import MeshPrim, Model, Part, from_polygons, joined, placed, triangulate
 from .readers.gltffile import read_gltf
 from .readers.polygonfiles import read_obj, read_off, read_ply
 from .scene import USD_EXTENSIONS
@@ -58,12 +58,15 @@ class LoadedModel:
     """All its polygons as the file has them."""
     looks: list[Look]
     """What the polygons look like, by the number that each has in the drawing."""
+    prims: list[MeshPrim]
+    """Of a USD file, the meshes that it is made from, in the same frame and unit."""
 
     def scaled(self, factor: float) -> LoadedModel:
         """Return the model made larger by a factor, from the origin."""
         mesh, drawing = self.mesh.copy(), replace(self.drawing, vertices=self.drawing.vertices * factor)
         mesh.vertices *= factor
-        return replace(self, mesh=mesh, drawing=drawing)
+        prims = [_cage_with(prim, prim.cage.vertices * factor) for prim in self.prims]
+        return replace(self, mesh=mesh, drawing=drawing, prims=prims)
 
     def part(self, name: str) -> trimesh.Trimesh:
         """Return the mesh of the triangles of ``region`` alone."""
@@ -90,13 +93,14 @@ def load_mesh(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> tri
     return load_model(path, up_axis=up_axis, prim=prim).mesh
 
 
-def load_model(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> LoadedModel:
+def load_model(path: Path, *, up_axis: str = "Y", prim: str | None = None, time: float | None = None) -> LoadedModel:
     """Read a model file: all its objects, placed, in metres where the file says its unit.
 
     Args:
         path: the file; its extension tells its format.
         up_axis: Y or Z; models that say which axis points up are turned so that this one does.
         prim: path of the prim below which the meshes of a USD file are read; its default prim if None.
+        time: time code at which a USD file is read; at rest if None.
 
     Raises:
         SceneError: the file has an unknown extension, needs packages that are missing, cannot be read, or holds no
@@ -115,7 +119,7 @@ def load_model(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> Lo
             raise SceneError(f"{path}: the file is empty; it has no triangles")
         # A coordinate may be too large to compute with; that it is not finite then is found below.
         with np.errstate(over="ignore", invalid="ignore"):
-            model = _read(path, kind, prim)
+            model = _read(path, kind, prim, time)
     except OSError as error:
         raise SceneError(f"{path}: cannot read the mesh: {error.strerror or error}") from error
     except SceneError:
@@ -128,12 +132,12 @@ def load_model(path: Path, *, up_axis: str = "Y", prim: str | None = None) -> Lo
         return _loaded(path, model, up_axis)
 
 
-def _read(path: Path, kind: str, prim: str | None) -> Model:
+def _read(path: Path, kind: str, prim: str | None, time: float | None) -> Model:
     # These take long to import, and COLLADA's reader may not be installed.
     if kind in USD_EXTENSIONS:
         from .readers.usdmodel import read_usd
 
-        return read_usd(path, prim)
+        return read_usd(path, prim, time=time)
     if kind == ".dae":
         from .readers.daefile import read_dae
 
@@ -175,10 +179,12 @@ def _loaded(path: Path, model: Model, up_axis: str) -> LoadedModel:
     if not extent > 0:
         raise SceneError(f"{path}: the mesh has no size; all its vertices coincide")
     normals = drawing.normals
+    prims = [_cage_with(prim, prim.cage.vertices * model.unit) for prim in model.prims]
     if rows := _TURNS.get((model.up_axis, up_axis)):
         turn = np.array(rows, float).T
         vertices = vertices @ turn
         normals = None if normals is None else normals @ turn
+        prims = [_cage_with(prim, prim.cage.vertices @ turn) for prim in prims]
     used = np.unique(drawing.looks[drawing.looks >= 0])
     # The last one, which -1 means, stays -1.
     look_numbers = np.full(len(model.looks) + 1, -1)
@@ -188,4 +194,9 @@ def _loaded(path: Path, model: Model, up_axis: str) -> LoadedModel:
     # Formats that repeat the vertices of every triangle would never be watertight otherwise. They repeat them exactly.
     vertices, number = np.unique(vertices, axis=0, return_inverse=True)
     mesh = trimesh.Trimesh(vertices, number.reshape(-1)[triangles], process=False)
-    return LoadedModel(path, mesh, polygons, drawing, [model.looks[number] for number in used])
+    return LoadedModel(path, mesh, polygons, drawing, [model.looks[number] for number in used], prims)
+
+
+def _cage_with(prim: MeshPrim, vertices: np.ndarray) -> MeshPrim:
+    """Return a mesh with its vertices, [vertex_count, 3], elsewhere."""
+    return replace(prim, cage=replace(prim.cage, vertices=vertices))

@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     import trimesh
 
     from .meshes import LoadedModel
+    from .shot import Shot
     from .voxelize import VoxelGrid
 
 log = logging.getLogger("warpjelly")
@@ -164,7 +165,10 @@ def plan_scene(scene: Scene) -> Plan:
     Raises:
         SceneError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
-    plan = Plan(scene, [_plan_body(body, scene) for body in scene.bodies])
+    shot = _open_shot(scene)
+    plan = Plan(scene, [_plan_body(body, scene, shot) for body in scene.bodies])
+    if shot is not None:
+        _require_meshes(shot, plan)
     most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]
     if plan.particle_count > most:
         raise SceneError(f"{plan.particle_count:,} particles are more than the {most:,} that arrays can hold")
@@ -176,7 +180,37 @@ def plan_scene(scene: Scene) -> Plan:
     return plan
 
 
-def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
+def _open_shot(scene: Scene) -> Shot | None:
+    if scene.output.over is None:
+        return None
+    # USD takes long to import, and planning other scenes does without.
+    from .shot import Shot
+
+    shot = Shot(scene)
+    if ends := shot.after(scene.frame_count):
+        log.warning(
+            "%s: the simulation ends at time code %g and the shot at %g; what it moved rests in between",
+            shot.path,
+            *ends,
+        )
+    return shot
+
+
+def _require_meshes(shot: Shot, plan: Plan) -> None:
+    """Refuse meshes of the shot that cannot be written over, or belong to two bodies."""
+    owners: dict[str, str] = {}
+    for body_plan in plan.bodies:
+        assert body_plan.model is not None
+        body = str(body_plan.body.name)
+        for prim in body_plan.model.prims:
+            shot.require_mesh(prim.path, body, plan.scene.frame_count)
+            if not np.isfinite(prim.cage.vertices).all():
+                raise SceneError(f"{shot.path}: {prim.path} has coordinates that are not finite numbers")
+            if owners.setdefault(prim.path, body) != body:
+                raise SceneError(f"bodies.{body}.prim: {prim.path} of {shot.path} belongs to '{owners[prim.path]}' too")
+
+
+def _plan_body(body: AnyBody, scene: Scene, shot: Shot | None) -> BodyPlan:
     """Say how a body is made: the one place that knows every kind."""
     if isinstance(body, NetworkBody):
         build = partial(build_network, body.points, body.springs(), body.rest_lengths)
@@ -193,7 +227,8 @@ def _plan_body(body: AnyBody, scene: Scene) -> BodyPlan:
         cells, cell_size = Cells.of(np.ones((1, 1, 1), bool)), body.size
         origin = np.full(3, -body.size / 2)
     elif isinstance(body, ModelBody):
-        voxelized = voxelize_model(body, up_axis=scene.up_axis)
+        time = None if shot is None else shot.start
+        voxelized = voxelize_model(body, up_axis=scene.up_axis, time=time)
         cells, origin, cell_size = voxelized.grid.cells, voxelized.grid.origin, voxelized.grid.cell_size
         triangles = len(voxelized.model.mesh.faces)
         model = voxelized.model if scene.output.surface == "model" else None
@@ -282,12 +317,13 @@ class VoxelizedModel:
     """What the user should know, a sentence each; they have been logged, too."""
 
 
-def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
+def voxelize_model(body: ModelBody, *, up_axis: str, time: float | None = None) -> VoxelizedModel:
     """Read and voxelize the model of a body.
 
     Args:
         body: names the file, and how to voxelize it.
         up_axis: Y or Z; a model that says which axis points up is turned so that this one does.
+        time: time code at which the model is read, if it is a USD file; at rest if None.
 
     Raises:
         InputError: the model cannot be used.
@@ -296,7 +332,7 @@ def voxelize_model(body: ModelBody, *, up_axis: str) -> VoxelizedModel:
     from .meshes import load_model
     from .voxelize import LOOK_RESOLUTION, is_closed, voxelize, voxelize_mesh
 
-    model = load_model(body.file, up_axis=up_axis, prim=body.prim)
+    model = load_model(body.file, up_axis=up_axis, prim=body.prim, time=time)
     scale = 1.0 if body.scale is None else body.scale
     if body.fit is not None:
         scale = body.fit / model.mesh.extents.max()

@@ -54,6 +54,16 @@ class Part:
 
 
 @dataclass(frozen=True)
+class MeshPrim:
+    """A mesh of a USD stage as it is stored: with all its vertices, and all polygons as they run there."""
+
+    path: str
+    """Of the prim."""
+    cage: Part
+    """Placed; with normals only if they are drawn with."""
+
+
+@dataclass(frozen=True)
 class Model:
     """What a model file holds."""
 
@@ -63,6 +73,8 @@ class Model:
     """Metres per unit, 1 where the file does not say."""
     up_axis: str = ""
     """X, Y or Z; empty where the file does not say."""
+    prims: list[MeshPrim] = field(default_factory=list)
+    """Of a USD file, the mesh that each part is made from."""
 
 
 def from_polygons(
@@ -98,16 +110,22 @@ def from_polygons(
 
 def placed(part: Part, matrix: np.ndarray) -> Part:
     """Move a part by a matrix for column vectors, [4, 4]; one that mirrors it turns its polygons round."""
-    # Equal vertices must stay equal to the last bit, which matrix products do not promise.
-    x, y, z = part.vertices.T[:, :, None]
-    moved = replace(part, vertices=x * matrix[:3, 0] + y * matrix[:3, 1] + z * matrix[:3, 2] + matrix[:3, 3])
     mirrored = np.linalg.det(matrix[:3, :3]) < 0
+    part = replace(part, vertices=moved(part.vertices, matrix))
     if part.normals is not None:
         a, b, c = matrix[:3, :3]
         # The inverse transpose times the determinant, which exists for flat ones, too.
         cofactors = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)])
-        moved = replace(moved, normals=unit(part.normals @ cofactors.T * (-1.0 if mirrored else 1.0)))
-    return moved.turned_round() if mirrored else moved
+        part = replace(part, normals=unit(part.normals @ cofactors.T * (-1.0 if mirrored else 1.0)))
+    return part.turned_round() if mirrored else part
+
+
+def moved(points: np.ndarray, matrix: np.ndarray) -> np.ndarray:
+    """Move points [count, 3] by a matrix for column vectors, [4, 4]; equal ones stay equal to the last bit."""
+    # Matrix products do not promise that.
+    x, y, z = points.T[:, :, None]
+    result: np.ndarray = x * matrix[:3, 0] + y * matrix[:3, 1] + z * matrix[:3, 2] + matrix[:3, 3]
+    return result
 
 
 def joined(parts: Sequence[Part]) -> Part:

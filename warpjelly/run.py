@@ -43,6 +43,7 @@ from .rundir import (
 )
 from .scene import Scene
 from .shapes import SURFACE, ShapeFrame
+from .shot import Shot
 from .signals import interruptions
 from .simulator import Simulator
 from .stability import evaluations
@@ -112,6 +113,8 @@ def simulate(
     folder = Path(output) if output is not None else Path("outputs") / scene.name
     if folder.exists() and not folder.is_dir():
         raise EnvironmentFailedError(f"{folder}: cannot write the run: it is a file; choose a folder with -o")
+    if scene.output.over is not None and folder.resolve() in scene.output.over.resolve().parents:
+        raise InputError(f"{folder}: the shot of output.over is in this folder; choose another with -o")
     if force and resume:
         raise InputError("--resume goes on with a run, --force replaces it: give one of them")
     try:
@@ -285,7 +288,8 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
         ``particles, springs, voxels``; ``materials``, the number of voxels of each by name; ``memory_bytes``, an
         estimate of the peak, and ``body_memory_bytes``, of each body by name; ``dt`` [s], ``substeps`` a frame,
         ``frames``; ``dt_limit`` and ``dt_limit_in_contact``, the largest stable step by integrator, s or None;
-        ``seconds``, an estimate from this machine's speed now; ``device``.
+        ``seconds``, an estimate from this machine's speed now; ``device``; ``over``, of a run over a shot, its file,
+        the meshes that move, and the first and the last time code.
 
     Raises:
         InputError: the scene cannot be built.
@@ -326,6 +330,19 @@ def forecast(scene: Scene, *, device: str = "auto") -> dict[str, Any]:
         "frames": scene.frame_count,
         "seconds": frame * (scene.frame_count - 1),
         "device": sim.device,
+        "over": _over_figures(sim),
+    }
+
+
+def _over_figures(sim: Simulator) -> dict[str, Any] | None:
+    """Return where in a shot a run writes, if it writes over one."""
+    if sim.scene.output.over is None:
+        return None
+    shot = Shot(sim.scene)
+    return {
+        "shot": str(shot.path),
+        "meshes": [shape.prim for shape in sim.model.shapes],
+        "time_codes": [shot.time(frame) for frame in (0, sim.scene.frame_count - 1)],
     }
 
 

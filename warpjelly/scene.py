@@ -826,6 +826,39 @@ class Output(Table):
     )
     velocities: Switch = Field(False, description="write point velocities, for motion blur")
     forces: Switch = Field(False, description="write the force on each point, N, as primvars:force")
+    over: Path | None = Field(
+        None,
+        description="a USD stage, the shot, relative to the scene file, which bodies are taken from where they stand: "
+        "what is written is a layer with the motion of their meshes, over the shot, and a root with both",
+    )
+    start: Number | None = Field(
+        None, description="with over, time code of the shot where the simulation starts; its first unless given"
+    )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _meshes_are_shown_over_a_shot(cls, data: Any) -> Any:
+        return {"surface": "model", **data} if isinstance(data, Mapping) and data.get("over") is not None else data
+
+    @field_validator("over", mode="after")
+    @classmethod
+    def _shot_is_relative_to_the_scene(cls, over: Path | None, info: ValidationInfo) -> Path | None:
+        return None if over is None else _existing(over, info)
+
+    @model_validator(mode="after")
+    def _keys_go_with_a_shot(self) -> Self:
+        if self.over is None and self.start is not None:
+            refuse("start", self.start, "goes with over")
+        if self.over is None:
+            return self
+        if self.over.suffix.lower() not in USD_EXTENSIONS:
+            refuse("over", str(self.over), f"must be a USD stage: {' '.join(USD_EXTENSIONS)}")
+        for key in ("look", "show", "spring_colors", "force_range", "color"):
+            if key in self.model_fields_set and getattr(self, key) != type(self).model_fields[key].default:
+                refuse(key, getattr(self, key), "does not go with over: meshes keep the look that the shot gives them")
+        if self.surface != "model":
+            refuse("surface", self.surface, "does not go with over, which moves the meshes of the shot: leave it out")
+        return self
 
     @model_validator(mode="after")
     def _look_goes_with_a_model(self) -> Self:
@@ -987,6 +1020,8 @@ class Scene(Table):
                 refuse(f"expect.{key}.body", None, f"name one of the bodies: {bodies}")
             if expectation.body is not None and expectation.body not in bodies.split(", "):
                 refuse(f"expect.{key}.body", expectation.body, f"no such body; bodies: {bodies}")
+        if self.output.over is not None:
+            self._require_bodies_of(self.output.over)
         if self.output.surface == "model" and not any(isinstance(body, ModelBody) for body in self.bodies):
             refuse("output.surface", "model", "no body is of type model; choose voxels or smooth")
         if self.duration is not None and self.frames is not None:
@@ -1003,6 +1038,22 @@ class Scene(Table):
         if self.solver.dt != "auto" and self.substeps_for(self.solver.dt) > MAX_SUBSTEPS:
             refuse("solver.dt", self.solver.dt, f"more than {MAX_SUBSTEPS} substeps a frame at {self.fps:g} fps")
         return self
+
+    def _require_bodies_of(self, shot: Path) -> None:
+        """Refuse bodies that are not as they are in a shot."""
+        for i, body in enumerate(self.bodies):
+            if not isinstance(body, ModelBody):
+                why = "with output.over each body is a model from the shot; put others into it first, or in another run"
+                refuse(f"bodies.{i}.type", body.type, why)
+            if not body.file.samefile(shot):
+                why = f"with output.over each body is a part of the shot, {shot}; put others into it first"
+                refuse(f"bodies.{i}.file", str(body.file), why)
+            if body.prim is None:
+                refuse(f"bodies.{i}.prim", None, "missing; with output.over, name the prim of the shot that is to move")
+            for key in ("scale", "fit"):
+                if getattr(body, key) is not None:
+                    why = "does not go with output.over: a body is as large as in the shot"
+                    refuse(f"bodies.{i}.{key}", getattr(body, key), why)
 
     @property
     def frame_count(self) -> int:

@@ -80,7 +80,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     except RecursionError as error:
         raise InputError(f"{path}: not valid TOML: lists or tables are nested too deep") from error
     except OSError as error:
-        raise InputError(f"{path}: cannot read the scene: {error.strerror}") from error
+        raise InputError(f"{path}: cannot read the scene: {error.strerror}{hint}") from error
 
 
 def _override(data: dict[str, Any], key: str, value: Any, path: Path) -> None:

@@ -17,6 +17,7 @@ from .shading import shared_normals
 
 if TYPE_CHECKING:
     from .meshes import LoadedModel
+    from .polygons import MeshPrim
     from .scene import Output
 
 # Names of prims below a body.
@@ -58,9 +59,16 @@ class Shape:
     width: float = 0.0
     """Thickness of springs or particles, m."""
     kinds: np.ndarray | None = None
-    """Kind of each spring, int [point_count / 2], where colours show it; otherwise all colours show forces."""
+    """Kind of each spring, int [point_count / 2], where colours show it."""
     model: LoadedModel | None = None
     """The model whose polygons these are."""
+    prim: str | None = None
+    """Path of the mesh of the shot that these are the vertices of, with ``output.over``."""
+
+    @property
+    def shows_force(self) -> bool:
+        """Whether its colours show forces."""
+        return self.kinds is None and self.prim is None
 
     @property
     def normal_count(self) -> int:
@@ -95,6 +103,8 @@ def shapes_of(body: str, lattice: Lattice, output: Output, model: LoadedModel | 
         output: what to show.
         model: the model that it was made from, in the frame of the body, where it is to be seen.
     """
+    if output.over is not None and model is not None:
+        return [_over(body, lattice, prim) for prim in model.prims if len(prim.cage.vertices)]
     faces = len(lattice.surface_quads) > 0
     shown = output.show if faces else [SPRINGS, PARTICLES]
     shapes = []
@@ -157,6 +167,15 @@ def _surface(body: str, lattice: Lattice, surface: str, model: LoadedModel | Non
         return Shape(body, SURFACE, *hung, *_as_polygons(quads))
     points, quads = _split_by_direction(lattice)
     return Shape(body, SURFACE, *_alone(lattice.surface_particles[points]), *_as_polygons(quads))
+
+
+def _over(body: str, lattice: Lattice, prim: MeshPrim) -> Shape:
+    """Hang all vertices of a mesh of the shot on the body; it has normals where the mesh has some of its own."""
+    cage = prim.cage
+    hung = embed(lattice, cage.vertices, containing_cells(lattice, cage.vertices))
+    polygons = cage.counts.astype(np.int32), cage.corners.astype(np.int32)
+    normals = None if cage.normals is None or not len(cage.corners) else shared_normals(cage)
+    return Shape(body, SURFACE, *hung, *polygons, corner_normals=normals, prim=prim.path)
 
 
 def _as_polygons(quads: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

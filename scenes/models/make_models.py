@@ -4,7 +4,7 @@ Run as `python scenes/models/make_models.py`.
 """
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -81,6 +81,27 @@ SKELETON_LUMPS: tuple[Lump, ...] = (
     ((0.12, 0.4, 0.08), (0.14, 0.06, 0.13), 0.06, 0.055, 0.03),  # fore leg
     ((0.13, 0.4, -0.22), (0.15, 0.06, -0.22), 0.06, 0.055, 0.03),  # hind leg
 )
+
+# The shot is in centimetres, z up, 24 frames a second. A moulded jelly with a cherry in its top stands a little above
+# its plate: outlines from the axis outwards, up and to the axis again, (radius, height) [cm].
+JELLY_RADII = (0.0, 2.6, 5.0, 5.6, 5.4, 5.1, 4.7, 4.2, 3.4, 2.0, 0.0)
+JELLY_HEIGHTS = (0.0, 0.0, 0.0, 0.3, 1.7, 3.1, 4.5, 5.9, 6.8, 7.1, 7.2)
+JELLY_OUTLINE = tuple(zip(JELLY_RADII, JELLY_HEIGHTS, strict=True))
+JELLY_SEGMENTS, JELLY_FLUTES, JELLY_DEPTH = 48, 8, 0.06  # around the axis; how deep the flutes are, share of the radius
+CHERRY_RADIUS, CHERRY_HEIGHT = 1.1, 7.9  # [cm]
+CHERRY_OUTLINE = tuple(
+    (CHERRY_RADIUS * math.sin(math.pi * k / 8), CHERRY_HEIGHT - CHERRY_RADIUS * math.cos(math.pi * k / 8))
+    for k in range(9)
+)
+CHERRY_SEGMENTS = 16
+SHOT_LOOKS: dict[str, tuple[Point, float]] = {
+    "vanilla": ((0.85, 0.66, 0.32), 0.3),
+    "caramel": ((0.32, 0.09, 0.01), 0.15),
+    "cherry": ((0.5, 0.01, 0.03), 0.15),
+    "china": ((0.75, 0.78, 0.8), 0.2),
+    "wood": ((0.25, 0.13, 0.06), 0.6),
+}  # linear colour, roughness
+PLATE_OUTLINE = ((0.0, 0.0), (6.0, 0.0), (9.5, 1.2), (9.6, 1.5), (6.2, 0.4), (0.0, 0.4))
 
 
 def tree() -> Manifold:
@@ -163,6 +184,132 @@ def blended_distance(lumps: list[Lump], x: float, y: float, z: float) -> float:
     return distance
 
 
+def turned(
+    outline: Sequence[tuple[float, float]], segments: int, flutes: int = 0
+) -> tuple[list[Point], list[list[int]]]:
+    """Return points and faces of an outline, from the axis and back to it, that is turned about the z axis."""
+    inner = outline[1:-1]
+    points = [(0.0, 0.0, outline[0][1])]
+    for radius, height in inner:
+        for k in range(segments):
+            angle = 2 * math.pi * k / segments
+            wide = radius * (1 + JELLY_DEPTH * math.cos(flutes * angle) if flutes else 1.0)
+            points.append((wide * math.cos(angle), wide * math.sin(angle), height))
+    points.append((0.0, 0.0, outline[-1][1]))
+    around = [(k, (k + 1) % segments) for k in range(segments)]
+    faces = [[0, 1 + b, 1 + a] for a, b in around]
+    for ring in range(len(inner) - 1):
+        low, high = 1 + ring * segments, 1 + (ring + 1) * segments
+        faces += [[low + a, low + b, high + b, high + a] for a, b in around]
+    last = 1 + (len(inner) - 1) * segments
+    return points, faces + [[last + a, last + b, len(points) - 1] for a, b in around]
+
+
+def usd_mesh(name: str, points: Sequence[Point], faces: Sequence[Sequence[int]], more: Iterable[str]) -> Iterator[str]:
+    """Yield the lines of a mesh of a stage."""
+    low, high = (tuple(pick(axis) for axis in zip(*points, strict=True)) for pick in (min, max))
+    yield f'def Mesh "{name}" (prepend apiSchemas = ["MaterialBindingAPI"])'
+    yield "{"
+    yield f"    float3[] extent = [{usd_point(low)}, {usd_point(high)}]"
+    yield f"    int[] faceVertexCounts = [{', '.join(str(len(face)) for face in faces)}]"
+    yield f"    int[] faceVertexIndices = [{', '.join(str(corner) for face in faces for corner in face)}]"
+    yield f"    point3f[] points = [{', '.join(map(usd_point, points))}]"
+    yield from (f"    {line}" for line in more)
+    yield "}"
+
+
+def usd_point(point: Sequence[float]) -> str:
+    """Write a point of a stage [cm]."""
+    return f"({', '.join(f'{value + 0.0:.4f}' for value in point)})"
+
+
+def usd_look(name: str, color: Point, roughness: float) -> Iterator[str]:
+    """Yield the lines of a material of a stage."""
+    yield from (
+        f'def Material "{name}"',
+        "{",
+        f"    token outputs:surface.connect = </shot/looks/{name}/surface.outputs:surface>",
+    )
+    yield from ('    def Shader "surface"', "    {", '        uniform token info:id = "UsdPreviewSurface"')
+    yield f"        color3f inputs:diffuseColor = ({', '.join(map(str, color))})"
+    yield from (f"        float inputs:roughness = {roughness}", "        token outputs:surface", "    }", "}")
+
+
+def shot_lines() -> Iterator[str]:
+    """Yield the lines of a shot: a dessert on a table, its looks, a light, and a camera that moves."""
+
+    def look(name: str) -> str:
+        return f"rel material:binding = </shot/looks/{name}>"
+
+    smooth, flat = ('uniform token subdivisionScheme = "catmullClark"', 'uniform token subdivisionScheme = "none"')
+    jelly, jelly_faces = turned(JELLY_OUTLINE, JELLY_SEGMENTS, JELLY_FLUTES)
+    sauce = range(len(jelly_faces) - 2 * JELLY_SEGMENTS, len(jelly_faces))
+    subset = (
+        'uniform token subsetFamily:materialBind:familyType = "nonOverlapping"',
+        'def GeomSubset "sauce" (prepend apiSchemas = ["MaterialBindingAPI"])',
+        "{",
+        '    uniform token elementType = "face"',
+        '    uniform token familyName = "materialBind"',
+        f"    int[] indices = [{', '.join(map(str, sauce))}]",
+        f"    {look('caramel')}",
+        "}",
+    )
+    yield from (
+        "#usda 1.0",
+        "(",
+        '    "Made by scenes/models/make_models.py; change that script, not this file."',
+        '    defaultPrim = "shot"',
+        "    startTimeCode = 1001",
+        "    endTimeCode = 1036",
+        "    timeCodesPerSecond = 24",
+        "    framesPerSecond = 24",
+        "    metersPerUnit = 0.01",
+        '    upAxis = "Z"',
+        ")",
+        'def Xform "shot" (kind = "assembly")',
+        "{",
+        '    def Xform "dessert"',
+        "    {",
+        "        double3 xformOp:translate = (20, 10, 3)",
+        "        float3 xformOp:rotateXYZ = (6, 4, 30)",
+        '        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]',
+    )
+    for line in usd_mesh("jelly", jelly, jelly_faces, (smooth, look("vanilla"), *subset)):
+        yield f"        {line}"
+    for line in usd_mesh("cherry", *turned(CHERRY_OUTLINE, CHERRY_SEGMENTS), (smooth, look("cherry"))):
+        yield f"        {line}"
+    yield "    }"
+    place = ("double3 xformOp:translate = (20, 10, 0)", 'uniform token[] xformOpOrder = ["xformOp:translate"]')
+    for line in usd_mesh("plate", *turned(PLATE_OUTLINE, JELLY_SEGMENTS), (smooth, look("china"), *place)):
+        yield f"    {line}"
+    table: list[Point] = [(-60.0, -60.0, 0.0), (100.0, -60.0, 0.0), (100.0, 80.0, 0.0), (-60.0, 80.0, 0.0)]
+    for line in usd_mesh("table", table, [[0, 1, 2, 3]], (flat, look("wood"))):
+        yield f"    {line}"
+    yield from (
+        '    def Camera "camera"',
+        "    {",
+        "        float focalLength = 50",
+        "        float focusDistance = 49",
+        "        float horizontalAperture = 36",
+        "        float verticalAperture = 20.25",
+        "        float2 clippingRange = (1, 1000)",
+        "        double3 xformOp:translate.timeSamples = { 1001: (20, -36, 18), 1036: (22.5, -36, 18) }",
+        "        float3 xformOp:rotateXYZ = (75, 0, 0)",
+        '        uniform token[] xformOpOrder = ["xformOp:translate", "xformOp:rotateXYZ"]',
+        "    }",
+        '    def DomeLight "sky"',
+        "    {",
+        "        float inputs:intensity = 1",
+        "    }",
+        '    def Scope "looks"',
+        "    {",
+    )
+    for name, (color, roughness) in SHOT_LOOKS.items():
+        for line in usd_look(name, color, roughness):
+            yield f"        {line}"
+    yield from ("    }", "}")
+
+
 def obj_lines(parts: dict[str, Manifold], library: str) -> Iterator[str]:
     """Yield the lines of an OBJ file of the union of parts, in an order that depends on the geometry alone.
 
@@ -203,6 +350,7 @@ def write_models(folder: Path) -> None:
     models = {make.__name__: {make.__name__: make()} for make in (tree, coupler, skeleton)} | {"creature": creature()}
     texts = {f"{name}.obj": obj_lines(parts, f"{name}.mtl") for name, parts in models.items()}
     texts["creature.mtl"] = mtl_lines(CREATURE_COLORS)
+    texts["dessert.usda"] = shot_lines()
     for name, lines in texts.items():
         (folder / name).write_bytes(("\n".join(lines) + "\n").encode("ascii"))
 

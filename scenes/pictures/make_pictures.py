@@ -24,6 +24,7 @@ FRAMES = {
     "coupler_drop": [0, 6, 13, 30, 119],
     "creature_drop": [0, 8, 13, 24, 149],
     "two_materials": [0, 14, 20, 28, 119],
+    "dessert_shot": [1001, 1003, 1005, 1008, 1036],
     "three_networks": [0, 20, 30, 60, 179],
     "pile": [0, 22, 36, 60, 119],
     "falling_cloth": [0, 17, 24, 35, 149],

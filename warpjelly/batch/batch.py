@@ -122,11 +122,11 @@ def _run(
         # To import this takes the better part of a second, in which the engine gets ready.
         from .ledger import Ledger, sort_out
 
-        jobs, results = sort_out(folder, entries, resume=resume, force=force)
-        ledger = Ledger(folder, entries, engine, results)
-        watcher.begin(jobs, len(results))
+        agenda = sort_out(folder, entries, resume=resume, force=force)
+        ledger = Ledger(folder, entries, engine, agenda)
+        watcher.begin(agenda.jobs, len(agenda.results))
         try:
-            for result in engine.run(jobs, watcher=watcher, stopping=interrupted):
+            for result in engine.run(agenda.jobs, watcher=watcher, stopping=interrupted):
                 ledger.add(result)
         finally:
             batch = Batch(folder, ledger.write())

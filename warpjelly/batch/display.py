@@ -118,6 +118,11 @@ class Live(Lines):
     def end(self, worker: str, job: Job, result: Result) -> None:
         """Show that a run has ended."""
         super().end(worker, job, result)
+        if worker in self._rows:
+            frames = job.scene.frame_count
+            self._progress.update(
+                self._rows[worker], completed=frames, text="finished" if not result.reason else "failed"
+            )
         self._show()
 
     def tell(self, job: Job, result: Result) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -32,20 +34,21 @@ class Ledger:
         folder: of the batch.
         entries: its runs.
         engine: what does them.
-        results: of those that need not be done.
+        agenda: what it does of them.
     """
 
-    def __init__(self, folder: Path, entries: Sequence[Entry], engine: Engine, results: Mapping[str, Result]) -> None:
+    def __init__(self, folder: Path, entries: Sequence[Entry], engine: Engine, agenda: Agenda) -> None:
         self._folder = folder
         self._began, self._date = time.monotonic(), datetime.now(UTC)
         self._entries = {entry.name: entry for entry in entries}
         self._engine = engine
-        self._runs = {name: describe(folder, entry, results.get(name)) for name, entry in self._entries.items()}
+        self._hashes = agenda.hashes
+        self._runs = {name: self._describe(name, agenda.results.get(name)) for name in self._entries}
         self.write()
 
     def add(self, result: Result) -> None:
         """Take in what came of a run."""
-        self._runs[result.name] = describe(self._folder, self._entries[result.name], result)
+        self._runs[result.name] = self._describe(result.name, result)
         if time.monotonic() - self._written > RECORD_INTERVAL:
             self.write()
 
@@ -66,11 +69,23 @@ class Ledger:
         self._written = time.monotonic()
         return record
 
+    def _describe(self, name: str, result: Result | None) -> dict[str, Any]:
+        return describe(self._folder, self._entries[name], result, self._hashes.get(name))
 
-def sort_out(
-    folder: Path, entries: Sequence[Entry], *, resume: bool, force: bool
-) -> tuple[list[Job], dict[str, Result]]:
-    """Find out what is to be done, and what is known already: runs that are finished, or cannot be begun.
+
+@dataclass(frozen=True)
+class Agenda:
+    """What a batch has to do."""
+
+    jobs: list[Job]
+    results: dict[str, Result]
+    """Of runs that need not be done: they are finished, or cannot be begun."""
+    hashes: dict[str, str]
+    """Of the scenes that can be read, by the names of the runs; see ``scene_hash``."""
+
+
+def sort_out(folder: Path, entries: Sequence[Entry], *, resume: bool, force: bool) -> Agenda:
+    """Find out what is to be done, and what is known already.
 
     Args:
         folder: of the batch.
@@ -81,31 +96,42 @@ def sort_out(
     Raises:
         InputError: there are some, or another process is writing to a run directory.
     """
-    sources = {entry.name: entry.source for entry in entries}
-    results = {entry.name: Result(entry.name, InputError.exit_code, entry.problem) for entry in entries}
-    sound = {entry.name: entry.scene for entry in entries if entry.scene is not None}
-    _wait_for_orphans([folder / name for name in sound])
-    if resume:
-        finished = _find_finished(folder, sound)
-        outdated = [name for name in sound if name not in finished and _is_outdated(folder / name, sound[name])]
-        if outdated and not force:
-            raise InputError(
-                f"{folder / outdated[0]}: holds a finished run of another scene or version (and {len(outdated) - 1} "
-                "more do); replace these with --resume --force, or choose another folder with -o"
-            )
-        results |= {name: Result(name, 0, None, attempts=0) for name in finished}
-        sound = {name: scene for name, scene in sound.items() if name not in finished}
-    memory, jobs = Estimator(), []
-    for name, scene in sound.items():
-        try:
-            needed = memory.memory_bytes(scene)
-        except Exception as error:
-            why, code = verdict(error)
-            results[name] = Result(name, code, f"{sources[name]}: {why}")
+    results: dict[str, Result] = {}
+    hashes, jobs, estimator = {}, [], Estimator()
+    for entry in entries:
+        if entry.scene is None:
+            results[entry.name] = Result(entry.name, InputError.exit_code, entry.problem)
             continue
-        del results[name]
-        jobs.append(Job(name, scene, folder / name, needed, resume=resume))
-    return jobs, results
+        with _told(entry, results):
+            hashes[entry.name] = scene_hash(entry.scene)
+    _wait_for_orphans([folder / name for name in hashes])
+    sound = [(entry, entry.scene) for entry in entries if entry.scene is not None and entry.name in hashes]
+    if resume:
+        finished = _find_finished(folder, hashes)
+        results |= {name: Result(name, 0, None, attempts=0) for name in finished}
+        sound = [(entry, scene) for entry, scene in sound if entry.name not in finished]
+        outdated = [entry.name for entry, scene in sound if _is_outdated(folder / entry.name, scene)]
+        if outdated and not force:
+            more = f" (and {len(outdated) - 1} more do)" if len(outdated) > 1 else ""
+            raise InputError(
+                f"{folder / outdated[0]}: holds a finished run of another scene or version{more}; replace with "
+                "--resume --force, or choose another folder with -o"
+            )
+    for entry, scene in sound:
+        with _told(entry, results):
+            needed = estimator.memory_bytes(scene)
+            jobs.append(Job(entry.name, scene, folder / entry.name, needed, resume=resume))
+    return Agenda(jobs, results, hashes)
+
+
+@contextmanager
+def _told(entry: Entry, results: dict[str, Result]) -> Iterator[None]:
+    """Make whatever is wrong with a run its result."""
+    try:
+        yield
+    except Exception as error:
+        why, code = verdict(error)
+        results[entry.name] = Result(entry.name, code, f"{entry.source}: {why}")
 
 
 def _wait_for_orphans(folders: Sequence[Path]) -> None:
@@ -122,16 +148,15 @@ def _wait_for_orphans(folders: Sequence[Path]) -> None:
                 time.sleep(0.1)
 
 
-def _find_finished(folder: Path, scenes: Mapping[str, Scene]) -> set[str]:
+def _find_finished(folder: Path, hashes: Mapping[str, str]) -> set[str]:
     """Return the names of runs that are finished, whatever they were called when they were simulated."""
-    hashes = {name: scene_hash(scene) for name, scene in scenes.items()}
     there: dict[str, str] = {}
     for path in folder.glob(f"*/{RECORD_NAME}"):
         record = read_record(path.parent)
         if not (record["interrupted"] or record["diverged"]):
             there[path.parent.name] = record.get("scene_hash", "")
     finished = {name for name, value in hashes.items() if there.get(name) == value}
-    spare = {value: name for name, value in there.items() if name not in finished and name not in scenes}
+    spare = {value: name for name, value in there.items() if name not in finished and name not in hashes}
     for name, value in hashes.items():
         if name not in finished and value in spare and not (folder / name).exists():
             old = folder / spare.pop(value)

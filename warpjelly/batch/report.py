@@ -9,7 +9,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..checkpoint import scene_hash
 from ..errors import INTERRUPTED, InputError
 from ..files import whole_file
 from ..rundir import METRICS_NAME, RECORD_NAME, read_record
@@ -25,19 +24,19 @@ _GREATEST = ("max_speed", "max_penetration", "max_overlap", "contacts")
 _LAST = ("kinetic", "elastic", "potential", "spring_losses", "contact_losses", "friction_losses", "field_work")
 
 
-def describe(folder: Path, entry: Entry, result: Result | None) -> dict[str, Any]:
+def describe(folder: Path, entry: Entry, result: Result | None, scene_hash: str | None) -> dict[str, Any]:
     """Return what batch.json says of a run; paths are relative to the folder of the batch.
 
     Args:
         folder: of the batch.
         entry: the run.
         result: what came of it, None if it was not begun.
+        scene_hash: of its scene, if that can be read.
     """
     own = folder / entry.name
-    own_hash = None if entry.scene is None else scene_hash(entry.scene)
     record = read_record(own) if result is not None and (own / RECORD_NAME).is_file() else {}
     # There may be a run of another scene, in whose place this one could not begin.
-    recorded = own_hash is not None and record.get("scene_hash") == own_hash
+    recorded = scene_hash is not None and record.get("scene_hash") == scene_hash
     return {
         "name": entry.name,
         "source": entry.source,
@@ -48,7 +47,7 @@ def describe(folder: Path, entry: Entry, result: Result | None) -> dict[str, Any
         "attempts": 0 if result is None else result.attempts,
         "stage": _stage_of(folder, own) if recorded else None,
         "log": f"{entry.name}/{LOG_NAME}" if result is not None and (own / LOG_NAME).is_file() else None,
-        "scene_hash": own_hash,
+        "scene_hash": scene_hash,
         "figures": _figures(own, record) if recorded else {},
         "expect": record["expect"] if recorded else [],
     }

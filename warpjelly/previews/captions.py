@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from pxr import Usd
 
-from ..colors import SRGB_TABLE, srgb_from_linear
+from ..colors import SRGB_TABLE
+from .legends import Legend, legend_of
 
 _INK = (70, 74, 84)
 _GAP = 4
@@ -29,21 +30,20 @@ def captioned(stage: Usd.Stage, frames: Sequence[int], panels: Sequence[np.ndarr
         label = f"{frame / stage.GetTimeCodesPerSecond():.3f} s   frame {frame}"
         draw.text((left + text, height - text), label, fill=_INK, font=font, anchor="ls")
 
-    legend = stage.GetDefaultPrim().GetCustomDataByKey("legend") if stage.GetDefaultPrim() else None
+    legend = legend_of(stage)
     if legend and height >= 120:
         if with_legend:
             _draw_force_legend(picture, draw, font, legend, width)
-        _draw_spring_legend(picture, draw, font, legend.get("springs", {}))
+        _draw_spring_legend(picture, draw, font, legend.springs)
     return picture
 
 
-def _draw_force_legend(picture: Any, draw: Any, font: Any, legend: Mapping[str, Any], width: int) -> None:
+def _draw_force_legend(picture: Any, draw: Any, font: Any, legend: Legend, width: int) -> None:
     """Draw the colour map of forces into the lower right corner; a frame is ``width`` pixels wide."""
     from PIL import Image
 
     text, height = font.size, picture.height
-    low, high = (f"{force:.2g}" for force in legend["range"])
-    caption = f"{legend['quantity']}, {legend['unit']}"
+    low, caption, high = legend.low, legend.caption, legend.high
     # The bar is as wide as its captions need, a line's height between them; the middle one is centred.
     needed = font.getlength(caption) + 2 * max(font.getlength(low), font.getlength(high)) + 2 * text
     bar = Image.fromarray(np.rint(SRGB_TABLE[None] * 255).astype(np.uint8))
@@ -58,12 +58,11 @@ def _draw_force_legend(picture: Any, draw: Any, font: Any, legend: Mapping[str, 
         draw.text((x, height - text), label, fill=_INK, font=font, anchor=anchor)
 
 
-def _draw_spring_legend(picture: Any, draw: Any, font: Any, colors: Mapping[str, Any]) -> None:
-    """Name the kinds of springs in their colours, linear, in the upper right corner."""
+def _draw_spring_legend(picture: Any, draw: Any, font: Any, colors: Mapping[str, list[int]]) -> None:
+    """Name the kinds of springs in their colours, sRGB, in the upper right corner."""
     text, right = font.size, picture.width - font.size
     for name, color in reversed(list(colors.items())):
         draw.text((right, 2 * text), name, fill=_INK, font=font, anchor="rs")
         right -= round(font.getlength(name)) + text // 2
-        shown = np.rint(srgb_from_linear(np.array(color)) * 255).astype(int)
-        draw.rectangle([right - text // 2, 2 * text - text // 2, right, 2 * text], fill=tuple(shown.tolist()))
+        draw.rectangle([right - text // 2, 2 * text - text // 2, right, 2 * text], fill=tuple(color))
         right -= 3 * text // 2

@@ -44,7 +44,8 @@ def render_preview(
         source: a stage file or a run directory.
         output: the file to make; it appears under its name only when it is complete.
         frames: numbers of frames. Of a PNG those to show; None shows the one with the greatest forces, which is the
-            moment of the hardest impact. Of a movie or page the first and the last; None shows all.
+            moment of the hardest impact, or the last where no colours show forces. Of a movie or page the first and the
+            last; None shows all.
         every: a movie or page shows each ``every``-th frame from the first on.
         size: width and height of each frame of a picture or movie, pixels. Those of an MP4 are rounded up to even
             numbers.
@@ -105,13 +106,13 @@ def _chosen_frames(
 
 
 def _brightest_frame(stage: Usd.Stage, first: int, last: int) -> int:
-    """Return the frame with the brightest bodies: along the colour map, that is the one with the greatest forces."""
+    """Return the frame with the brightest bodies, which have the greatest forces; without colours, the last."""
     brightness = np.zeros(last - first + 1)
     for mesh in shapes_in(stage, UsdGeom.PointBased):
         primvar = UsdGeom.Primvar(mesh.GetDisplayColorAttr())
         if primvar.ValueMightBeTimeVarying():
             brightness += [np.sum(np.array(primvar.ComputeFlattened(t))[:, 1]) for t in range(first, last + 1)]
-    return first + int(np.argmax(brightness))
+    return first + int(np.argmax(brightness)) if brightness.any() else last
 
 
 def _write_picture(

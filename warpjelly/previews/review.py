@@ -13,7 +13,7 @@ import html
 import json
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
 from importlib import resources
 from types import EllipsisType
@@ -26,7 +26,8 @@ from ..colors import SRGB_TABLE, srgb_from_linear
 from ..errors import InputError
 from ..looks import Texture
 from ..polygons import triangulate
-from .solids import colors_at, diffuse, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
+from .legends import legend_of
+from .solids import colors_at, diffuse, looks_of, room_floor, shapes_in, subset_of_faces, texture_pixels, the_camera
 
 # More than that, no browser holds.
 MAX_BYTES = 1_000_000_000
@@ -95,8 +96,9 @@ def review_page(
         "legend": _legend(stage),
         "shapes": described,
     }
+    default = stage.GetDefaultPrim()
     values = {
-        "TITLE": html.escape(Usd.ModelAPI(stage.GetDefaultPrim()).GetAssetName() or "stage"),
+        "TITLE": html.escape((Usd.ModelAPI(default).GetAssetName() if default else "") or "stage"),
         # A script ends at the first "</", even in a string.
         "STAGE": json.dumps(description).replace("</", "<\\/"),
         "ARRAYS": base64.b64encode(zlib.compress(b"".join(arrays), 9)).decode(),
@@ -116,7 +118,7 @@ def _surfaces(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:
         triangles, faces = triangulate(np.array(points.Get(frame)).reshape(-1, 3)[chosen], counts, corners)
         subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
         own = subset_of_faces(subsets, len(counts))
-        colors = [*(_plain_color(subset.GetPrim(), images) for subset in subsets), None]
+        colors = [*(_plain_color(prim, images) for prim in looks_of(mesh, subsets)), None]
         order = np.argsort(own[faces], kind="stable")
         numbers, sizes = np.unique(own[faces], return_counts=True)
         parts = [
@@ -273,16 +275,6 @@ def _camera(stage: Usd.Stage, frame: int) -> dict[str, Any]:
 
 def _legend(stage: Usd.Stage) -> dict[str, Any] | None:
     """Return what the colours mean, in sRGB."""
-    legend = stage.GetDefaultPrim().GetCustomDataByKey("legend") if stage.GetDefaultPrim() else None
-    if not legend:
+    if (legend := legend_of(stage)) is None:
         return None
-    return {
-        "low": f"{legend['range'][0]:.2g}",
-        "high": f"{legend['range'][1]:.2g}",
-        "caption": f"{legend['quantity']}, {legend['unit']}",
-        "colors": np.rint(SRGB_TABLE[::15] * 255).astype(int).tolist(),
-        "springs": {
-            name: np.rint(srgb_from_linear(np.array(color)) * 255).astype(int).tolist()
-            for name, color in legend.get("springs", {}).items()
-        },
-    }
+    return asdict(legend) | {"colors": np.rint(SRGB_TABLE[::15] * 255).astype(int).tolist()}

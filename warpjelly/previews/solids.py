@@ -117,13 +117,13 @@ class StageDrawing:
         counts = np.array(mesh.GetFaceVertexCountsAttr().Get(frame))
         corners = np.array(mesh.GetFaceVertexIndicesAttr().Get(frame))
         subsets = UsdShade.MaterialBindingAPI(mesh).GetMaterialBindSubsets()
-        if not subsets:
+        looks = looks_of(mesh, subsets)
+        if not looks:
             normals = mesh.GetNormalsAttr().Get(frame)
             by_corner = _by_corner(mesh, "normals", frame)
             if by_corner is None:
-                surface = _polygons(self._pyvista, points, counts, corners)
-                if normals is not None and len(normals) == len(points):
-                    surface.point_data.active_normals = np.array(normals)
+                by_point = normals if normals is not None and len(normals) == len(points) else None
+                surface = _shaded(_polygons(self._pyvista, points, counts, corners), by_point)
                 _color(surface, colors_at(mesh, frame, len(points)))
                 yield Solid(surface, shows_force=bool(mesh.GetDisplayColorPrimvar().GetTimeSamples()))
                 return
@@ -133,18 +133,19 @@ class StageDrawing:
         normals = _by_corner(mesh, "normals", frame)
         for number in np.unique(own).tolist():
             at = np.repeat(own == number, counts)
-            own_corners = np.arange(np.count_nonzero(at))
-            surface = _polygons(self._pyvista, points[corners[at]], counts[own == number], own_corners)
-            if normals is not None:
-                surface.point_data.active_normals = normals[at]
-            value, image = self._look(subsets[number].GetPrim()) if number < len(subsets) else (None, None)
+            value, image = self._look(looks[number]) if number < len(looks) else (None, None)
+            chosen, own_corners = corners[at], np.arange(np.count_nonzero(at))
+            if normals is None and not isinstance(value, Texture):
+                chosen, own_corners = np.unique(chosen, return_inverse=True)
+            surface = _polygons(self._pyvista, points[chosen], counts[own == number], own_corners)
+            surface = _shaded(surface, None if normals is None else normals[at])
             if isinstance(value, Texture) and uvs is not None:
                 surface.active_texture_coordinates = _placed_uvs(value, uvs[at])
                 yield Solid(surface, texture=image)
                 continue
             plain = _GREY if isinstance(value, Texture) else value
-            _color(surface, colors[corners[at]] if value is None else _bytes(plain, at.sum()))
-            yield Solid(surface, shows_force=value is None)
+            _color(surface, colors[chosen] if value is None else _bytes(plain, len(chosen)))
+            yield Solid(surface, shows_force=value is None and bool(mesh.GetDisplayColorPrimvar().GetTimeSamples()))
 
     def _look(self, prim: Usd.Prim) -> tuple[Any, pv.Texture | None]:
         """Return the diffuse colour of a prim, and its image if it is a texture."""
@@ -189,6 +190,14 @@ def _polygons(pyvista: Any, points: np.ndarray, counts: np.ndarray, corners: np.
     return pyvista.PolyData(points, faces=np.insert(corners, np.cumsum(counts) - counts, counts))
 
 
+def _shaded(surface: pv.PolyData, normals: Any) -> pv.PolyData:
+    """Give a surface its normals at the points [point_count, 3]; without some, those of a smooth surface."""
+    if normals is None:
+        return surface.compute_normals(cell_normals=False, consistent_normals=False, auto_orient_normals=False)
+    surface.point_data.active_normals = np.array(normals)
+    return surface
+
+
 def _by_corner(mesh: UsdGeom.Mesh, name: str, frame: int) -> np.ndarray | None:
     """Return what a primvar has at each corner, None if it has no such."""
     primvar = UsdGeom.PrimvarsAPI(mesh).GetPrimvar(name)
@@ -203,6 +212,12 @@ def subset_of_faces(subsets: Sequence[UsdGeom.Subset], face_count: int) -> np.nd
     for number, subset in enumerate(subsets):
         own[np.array(subset.GetIndicesAttr().Get(), int)] = number
     return own
+
+
+def looks_of(mesh: UsdGeom.Mesh, subsets: Sequence[UsdGeom.Subset]) -> list[Usd.Prim]:
+    """Return what has the materials of a mesh: its subsets, and itself for all other faces if it has no colours."""
+    own = [] if mesh.GetDisplayColorAttr().HasAuthoredValue() else [mesh.GetPrim()]
+    return [*(subset.GetPrim() for subset in subsets), *own]
 
 
 def diffuse(prim: Usd.Prim, images: dict[str, bytes]) -> Any:

@@ -56,16 +56,7 @@ def read_gltf(path: Path) -> Model:
     Raises:
         ValueError: its meshes are compressed, or it is no glTF file.
     """
-    data = path.read_bytes()
-    body = b""
-    if data.startswith(b"glTF"):
-        length = int.from_bytes(data[8:12], "little")
-        if len(data) < max(length, 20):
-            raise ValueError(f"it is cut off: {len(data):,} of {max(length, 20):,} bytes")
-        # A header, a chunk of text and one of bytes; each chunk starts with its length and type.
-        end = 20 + int.from_bytes(data[12:16], "little")
-        data, body = data[20:end], data[end + 8 :]
-    header = json.loads(data)
+    header, body = _header(path)
     needed = _COMPRESSIONS.intersection(header.get("extensionsRequired", []))
     if needed:
         raise ValueError(f"its meshes are compressed with {min(needed)}; save it without")
@@ -80,6 +71,30 @@ def read_gltf(path: Path) -> Model:
     ]
     looks = [_look(file, material, number) for number, material in enumerate(file.all("materials"))]
     return Model(parts, looks, up_axis="Y")
+
+
+def gltf_addresses(path: Path) -> list[str]:
+    """Return the paths of all files that a glTF or GLB file names."""
+    header, _ = _header(path)
+    uris = [item.get("uri", "data:") for kind in ("buffers", "images") for item in header.get(kind, [])]
+    return [unquote(uri) for uri in uris if not uri.startswith("data:")]
+
+
+def _header(path: Path) -> tuple[dict[str, Any], bytes]:
+    """Return the JSON of a file and the bytes behind it.
+
+    Raises:
+        ValueError: the file is cut off.
+    """
+    data = path.read_bytes()
+    if not data.startswith(b"glTF"):
+        return json.loads(data), b""
+    length = int.from_bytes(data[8:12], "little")
+    if len(data) < max(length, 20):
+        raise ValueError(f"it is cut off: {len(data):,} of {max(length, 20):,} bytes")
+    # A header, a chunk of text and one of bytes; each chunk starts with its length and type.
+    end = 20 + int.from_bytes(data[12:16], "little")
+    return json.loads(data[20:end]), data[end + 8 :]
 
 
 def _content(path: Path, uri: str) -> bytes:

@@ -63,6 +63,18 @@ def read_mtl(model: Path, file: Path) -> list[Look]:
         why = getattr(error, "strerror", None) or error
         log.warning("%s: the materials of %s cannot be read: %s", model, file.name, why)
         return []
+    images = Images(file)
+    return [Look(name, _inputs(file, name, statements, images)) for name, statements in _materials(text).items()]
+
+
+def mtl_images(file: Path) -> list[str]:
+    """Return the names of all images that the materials of a file have."""
+    found = _materials(file.read_text(encoding="utf-8-sig", errors="replace"))
+    return [_options(found[name][kind])[1] for name in found for kind in _MAPS if kind in found[name]]
+
+
+def _materials(text: str) -> dict[str, dict[str, list[str]]]:
+    """Return the statements of each material: the words behind the first one."""
     found: dict[str, dict[str, list[str]]] = {}
     statements: dict[str, list[str]] = {}
     for line in text.splitlines():
@@ -71,8 +83,7 @@ def read_mtl(model: Path, file: Path) -> list[Look]:
             statements = found.setdefault(" ".join(words[1:]), {})
         elif words:
             statements[words[0].lower()] = words[1:]
-    images = Images(file)
-    return [Look(name, _inputs(file, name, statements, images)) for name, statements in found.items()]
+    return found
 
 
 def _inputs(file: Path, name: str, statements: dict[str, list[str]], images: Images) -> dict[str, Value]:

@@ -136,14 +136,25 @@ def read_obj(path: Path) -> Model:
     return Model([part], looks)
 
 
+def obj_libraries(path: Path) -> list[Path]:
+    """Return the files of materials that an OBJ file names, whether or not they are there."""
+    lines = re.findall(rb"^(?:\xef\xbb\xbf)?[ \t]*mtllib[ \t]([^#\r\n]*)", path.read_bytes(), re.MULTILINE)
+    names = (" ".join(line.decode(errors="replace").split()) for line in lines)
+    return [file for name in names for file in _library_files(path, name)]
+
+
+def _library_files(path: Path, names: str) -> list[Path]:
+    # A name may have spaces, and there may be several names.
+    whole = os.path.exists(path.parent / names)
+    return [path.parent / name.replace("\\", "/") for name in ([names] if whole else names.split())]
+
+
 def _obj_looks(path: Path, libraries: list[str], names: set[str]) -> list[Look]:
     """Read the materials that an OBJ file uses."""
     looks: dict[str, Look] = {}
     for library in libraries:
-        # A name may have spaces, and there may be several names.
-        whole = os.path.exists(path.parent / library)
-        for file in [library] if whole else library.split():
-            looks |= {look.name: look for look in read_mtl(path, path.parent / file.replace("\\", "/"))}
+        for file in _library_files(path, library):
+            looks |= {look.name: look for look in read_mtl(path, file)}
     unknown = sorted(names - looks.keys())
     if unknown and looks:
         log.warning("%s: materials that are in none of its files: %s", path, ", ".join(unknown))

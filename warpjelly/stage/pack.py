@@ -23,6 +23,7 @@ from .stagefiles import (
     export_layer,
     failed_write,
     find_stage,
+    open_clip,
     open_stage,
 )
 from .usd import FORCE, colors_in_range
@@ -43,7 +44,8 @@ def pack(source: Path, output: Path) -> None:
         output: the file to make, .usdc, .usda or .usdz; it appears under its name only when it is complete.
 
     Raises:
-        InputError: the source is no stage, or the output has another extension or a name that belongs to the run.
+        InputError: the source is no stage or not complete, or the output has another extension or a name that belongs
+            to the run.
         EnvironmentFailedError: the output cannot be written.
     """
     suffix = output.suffix.lower()
@@ -52,6 +54,8 @@ def pack(source: Path, output: Path) -> None:
     path, stage = find_stage(source), open_stage(source)
     if output.parent.resolve() == path.parent.resolve() and output.name in (path.name, *STAGE_NAMES):
         raise InputError(f"{output}: this name belongs to the stage that is to be packed; choose another")
+    if errors := stage.GetCompositionErrors():
+        raise InputError(f"{path}: the stage is not complete: {' '.join(str(errors[0]).split())}")
     try:
         output.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=".pack.", dir=output.parent) as folder:
@@ -68,17 +72,18 @@ def pack(source: Path, output: Path) -> None:
 
 
 def join_clips(
-    rest: Sdf.Layer, clips: Sequence[tuple[int, Path]], force_range: tuple[float, float], output: Path
+    rest: Sdf.Layer, clips: Sequence[tuple[float, Path]], force_range: tuple[float, float], output: Path
 ) -> None:
     """Write a stage in parts as one crate file, clip after clip.
 
     Args:
         rest: all but the samples; what it declares is what is taken of the clips.
-        clips: first frame and file of each, in order.
+        clips: first time code and file of each, in order.
         force_range: forces at both ends of the colours, N, where the clips still have the forces; other colours stay.
         output: the file to make, .usdc; it appears under its name only when it is complete.
 
     Raises:
+        InputError: a clip is missing or damaged.
         EnvironmentFailedError: the output cannot be written.
     """
     try:
@@ -90,13 +95,13 @@ def join_clips(
             joined.Reload(force=True)
             ends = [*(start for start, _ in clips), math.inf][1:]
             for (start, file), end in zip(clips, ends, strict=True):
-                _add_clip(joined, Sdf.Layer.OpenAsAnonymous(str(file)), start, end, force_range)
+                _add_clip(joined, open_clip(file), start, end, force_range)
     except (Tf.ErrorException, OSError) as error:
         raise failed_write(output, error) from error
 
 
 def _add_clip(joined: Sdf.Layer, clip: Sdf.Layer, start: float, end: float, force_range: tuple[float, float]) -> None:
-    """Add the samples of a clip from a frame to one before another to a layer with a file, and save it."""
+    """Add the samples of a clip from a time code to before another to a layer with a file, and save it."""
     waiting = 0
     for time, attribute in _samples(clip):
         if not start <= time < end or not joined.GetAttributeAtPath(attribute):
@@ -114,7 +119,7 @@ def _add_clip(joined: Sdf.Layer, clip: Sdf.Layer, start: float, end: float, forc
 
 def has_forces(clip: Path) -> bool:
     """Say whether a clip still has the forces that its colours show."""
-    return any(attribute.name == FORCE for _, attribute in _samples(Sdf.Layer.OpenAsAnonymous(str(clip))))
+    return any(attribute.name == FORCE for _, attribute in _samples(open_clip(clip)))
 
 
 def recolor_clip(path: Path, force_range: tuple[float, float], *, keep_forces: bool) -> None:
@@ -123,7 +128,7 @@ def recolor_clip(path: Path, force_range: tuple[float, float], *, keep_forces: b
     Raises:
         EnvironmentFailedError: the clip cannot be written; it is as it was before.
     """
-    clip = Sdf.Layer.OpenAsAnonymous(str(path))
+    clip = open_clip(path)
     samples = _samples(clip)
     for time, attribute in samples:
         if (colors := colors_in_range(clip, attribute, time, force_range)) is not None:

@@ -16,30 +16,33 @@ from pathlib import Path
 import numpy as np
 from pxr import Sdf, Usd
 
+from ..colors import range_in_words
 from ..errors import EnvironmentFailedError, InputError
 from ..files import whole_file
 from ..plan import clip_length
 from ..scene import Scene
 from ..shapes import Shape, ShapeFrame
 from .histogram import ForceHistogram
+from .layouts import World, layout_of
 from .pack import has_forces, join_clips, recolor_clip
 from .prims import WORLD
 from .stagefiles import (
     CLIPS_NAME,
     GEOMETRY_NAME,
     MANIFEST_NAME,
+    OVER_NAME,
     ROOT_NAME,
     STAGE_NAME,
-    TEXTURES_NAME,
     active_clips,
     clip_name,
     export_layer,
     open_stage,
     remove_parts,
+    remove_stage,
+    set_clips,
     set_progress,
 )
-from .surroundings import define_camera, define_colliders
-from .usd import author_colors, author_sample, declare_samples, define_rest, legend, set_metadata
+from .usd import author_colors, declare_samples
 
 log = logging.getLogger("warpjelly")
 
@@ -76,15 +79,14 @@ class StageWriter:
         self._folder = folder
         self._scene = scene
         self._shapes = list(shapes)
-        self._bounds = _bounds_of(rest)
-        self._rest_center = self._bounds.mean(axis=0)
+        self._layout = layout_of(scene, self._shapes, rest, folder)
         self._forces = ForceHistogram()
         self._fixed_range = None if scene.output.force_range == "auto" else scene.output.force_range
         self._starts: list[int] = []
         self._frame_count = 0
         _require_writable(folder)
         if resume is None:
-            remove_parts(folder)
+            remove_stage(folder)
         else:
             self._restore(resume)
         self._clip_forces: list[list[np.ndarray]] = []
@@ -111,15 +113,13 @@ class StageWriter:
         """Add one sample to the clip in memory.
 
         Args:
-            index: number of the frame and its time code; frames arrive in order.
+            index: number of the frame; frames arrive in order.
             samples: one for each shape, in the order of the shapes.
         """
         if index != self._frame_count:
             raise ValueError(f"frame {index} written where frame {self._frame_count} is due")
         for shape, sample in zip(self._shapes, samples, strict=True):
-            extent = author_sample(self._clip, index, shape, sample)
-            self._bounds[0] = np.minimum(self._bounds[0], extent[0])
-            self._bounds[1] = np.maximum(self._bounds[1], extent[1])
+            self._layout.author(self._clip, index, shape, sample)
         self._clip_forces.append([np.array(sample.forces, np.float32) for sample in samples])
         self._frame_count += 1
 
@@ -132,14 +132,15 @@ class StageWriter:
         if not self._clip_forces:
             return
         start = self.saved_count
-        if self._fixed_range is None:
+        if self._colors_wait:
             for forces in self._clip_forces:
                 self._forces.add(np.concatenate(forces))
         force_range = self._force_range()
         for index, forces in enumerate(self._clip_forces, start):
             for shape, own in zip(self._shapes, forces, strict=True):
-                author_colors(self._clip, index, shape, own, force_range)
-        self._clip.startTimeCode, self._clip.endTimeCode = start, self._frame_count - 1
+                author_colors(self._clip, self._layout.time(index), shape, own, force_range)
+        self._clip.startTimeCode = self._layout.time(start)
+        self._clip.endTimeCode = self._layout.time(self._frame_count - 1)
         export_layer(self._clip, self._folder / CLIPS_NAME / clip_name(start))
         self._starts.append(start)
         self._clip_forces.clear()
@@ -153,50 +154,62 @@ class StageWriter:
             EnvironmentFailedError: it cannot be written; the stage in parts is as good as before.
         """
         self.flush()
-        clips = [(start, self._folder / CLIPS_NAME / clip_name(start)) for start in self._starts]
-        if self._scene.output.format == "usdc":
+        clips = [(time, self._folder / CLIPS_NAME / name) for time, name in self._clips()]
+        whole_name = self._layout.whole_name if self._scene.output.format == "usdc" else None
+        if whole_name is None:
+            for _, clip in clips:
+                recolor_clip(clip, self._force_range(), keep_forces=self._scene.output.forces)
+        else:
             whole = Sdf.Layer.OpenAsAnonymous(str(self._folder / GEOMETRY_NAME))
-            self._define_motion(Usd.Stage.Open(whole))
-            join_clips(whole, clips, self._force_range(), self._folder / STAGE_NAME)
+            self._layout.define_motion(Usd.Stage.Open(whole), self.saved_count, self._force_range())
+            join_clips(whole, clips, self._force_range(), self._folder / whole_name)
+        if whole_name == STAGE_NAME:
+            (self._folder / ROOT_NAME).unlink()
+        else:
+            self._write_root(finished=True)
+        if whole_name is not None:
             remove_parts(self._folder)
-            return
-        for _, clip in clips:
-            recolor_clip(clip, self._force_range(), keep_forces=self._scene.output.forces)
-        self._write_root(finished=True)
-        # Of a run that was replaced.
-        (self._folder / STAGE_NAME).unlink(missing_ok=True)
+        # Of a run that was replaced, or gone on with.
+        for name in {STAGE_NAME, OVER_NAME} - {whole_name}:
+            (self._folder / name).unlink(missing_ok=True)
 
     def arrays(self) -> dict[str, np.ndarray]:
         """Return copies of what another writer needs besides the files to go on after the last clip."""
-        return {"frame_count": np.array(self.saved_count), "bounds": self._bounds.copy(), **self._forces.arrays()}
+        return {"frame_count": np.array(self.saved_count), **self._layout.arrays(), **self._forces.arrays()}
 
     def _restore(self, arrays: Mapping[str, np.ndarray]) -> None:
         """Go on after the last clip of another writer, even if its stage was brought into its final form."""
         self._frame_count = int(arrays["frame_count"])
-        self._bounds = arrays["bounds"].copy()
+        self._layout.restore(arrays)
         self._forces.restore(arrays)
         stage, folder = open_stage(self._folder), self._folder / CLIPS_NAME
-        if not (self._folder / ROOT_NAME).exists():
+        if clips := active_clips(stage):
+            # The root is written before a checkpoint, so it may have more clips.
+            starts = [self._layout.frame(time) for time, _ in clips]
+            self._starts = [start for start in starts if start < self._frame_count]
+        else:
             self._starts = [0]
             folder.mkdir(exist_ok=True)
-            _link(self._folder / STAGE_NAME, folder / clip_name(0))
-        else:
-            # The root is written before a checkpoint, so it may have more clips.
-            self._starts = [start for start, _ in active_clips(stage) if start < self._frame_count]
+            _link(self._folder / self._layout.whole_name, folder / clip_name(0))
         for start in self._starts:
             if not (folder / clip_name(start)).is_file():
                 raise InputError(
                     f"{folder / clip_name(start)}: missing, so the run cannot go on; start anew with --force"
                 )
-        if self._fixed_range is None and not has_forces(folder / clip_name(0)):
+        if self._colors_wait and not has_forces(folder / clip_name(0)):
             # They were removed when the run finished, and colours cannot be stretched over another range without.
             self._fixed_range = tuple(stage.GetPrimAtPath(WORLD).GetCustomDataByKey("legend")["range"])
             if self._scene.frame_count > self._frame_count:
                 log.warning(
-                    "%s: colours keep the range of the first %d frames, %.3g to %.3g N, whose forces were not kept; "
+                    "%s: colours keep the range of the first %d frames, %s to %s N, whose forces were not kept; "
                     "with output.forces = true they would be",
-                    *(self._folder, self._frame_count, *self._fixed_range),
+                    *(self._folder, self._frame_count, *range_in_words(self._fixed_range)),
                 )
+
+    @property
+    def _colors_wait(self) -> bool:
+        """Whether there are colours whose range only the whole run gives."""
+        return self._layout.shows_force and self._fixed_range is None
 
     def _force_range(self) -> tuple[float, float]:
         """Return the forces at both ends of the colours: as given, or those of the run so far."""
@@ -204,50 +217,37 @@ class StageWriter:
 
     def _new_clip(self) -> Sdf.Layer:
         clip = Sdf.Layer.CreateAnonymous(".usdc")
-        forces = self._scene.output.forces or self._fixed_range is None
+        forces = self._scene.output.forces or self._colors_wait
         declare_samples(clip, self._shapes, self._scene, forces=forces)
         return clip
 
     def _write_rest(self, rest: Sequence[ShapeFrame], provenance: Mapping[str, object]) -> None:
         layer, manifest = (Sdf.Layer.CreateAnonymous(suffix) for suffix in (".usdc", ".usda"))
-        define_rest(
-            Usd.Stage.Open(layer),
-            scene=self._scene,
-            shapes=self._shapes,
-            rest=rest,
-            provenance=provenance,
-            texture_folder=self._folder / TEXTURES_NAME,
-        )
+        self._layout.define_rest(layer, rest, provenance, self._folder)
         declare_samples(manifest, self._shapes, self._scene, forces=self._scene.output.forces)
         (self._folder / CLIPS_NAME).mkdir(exist_ok=True)
         export_layer(layer, self._folder / GEOMETRY_NAME)
         export_layer(manifest, self._folder / CLIPS_NAME / MANIFEST_NAME)
 
-    def _write_root(self, *, finished: bool) -> None:
-        """Write the root, which says which clip has which frames."""
-        root = Sdf.Layer.CreateAnonymous(".usda")
-        stage = Usd.Stage.Open(root)
-        set_metadata(stage, self._scene)
-        self._define_motion(stage)
-        if not finished:
-            set_progress(stage, self.saved_count, self._scene.frame_count)
-        if self._starts:
-            clips, last = Usd.ClipsAPI(stage.GetPrimAtPath(WORLD)), self.saved_count - 1
-            clips.SetClipPrimPath(str(WORLD))
-            clips.SetClipManifestAssetPath(f"./{CLIPS_NAME}/{MANIFEST_NAME}")
-            clips.SetClipAssetPaths([f"./{CLIPS_NAME}/{clip_name(start)}" for start in self._starts])
-            clips.SetClipActive([(start, number) for number, start in enumerate(self._starts)])
-            clips.SetClipTimes([(0, 0), (last, last)][: 1 + last])
-        # Without the stage, which would look for the sublayer beside a layer that is nowhere yet.
-        del stage
-        root.defaultPrim = WORLD.name
-        root.subLayerPaths.append(f"./{GEOMETRY_NAME}")
-        export_layer(root, self._folder / ROOT_NAME)
+    def _clips(self) -> list[tuple[float, str]]:
+        """Return the first time code and the name of each clip."""
+        return [(self._layout.time(start), clip_name(start)) for start in self._starts]
 
-    def _define_motion(self, stage: Usd.Stage) -> None:
-        """Write what depends on the motion so far."""
-        force_range = self._force_range()
-        _define_motion(stage, self._scene, self._shapes, self._bounds, self._rest_center, self.saved_count, force_range)
+    def _write_root(self, *, finished: bool) -> None:
+        """Write the root, which says which clip has which frames, or that one layer has them all."""
+        root, layout = Sdf.Layer.CreateAnonymous(".usda"), self._layout
+        layout.set_metadata(root)
+        stage = Usd.Stage.Open(root)
+        layout.define_motion(stage, self.saved_count, self._force_range())
+        in_parts = not finished or self._scene.output.format == "clips"
+        for path in layout.clip_prims if in_parts and self._starts else ():
+            set_clips(stage.OverridePrim(path), self._clips(), layout.time(self.saved_count - 1))
+        # Without the stage, which would look for the sublayers beside a layer that is nowhere yet.
+        del stage
+        if not finished:
+            set_progress(root, self.saved_count, self._scene.frame_count)
+        root.subLayerPaths = [f"./{GEOMETRY_NAME if in_parts else layout.whole_name}", *layout.under]
+        export_layer(root, self._folder / ROOT_NAME)
 
 
 def write_still(path: Path, *, scene: Scene, shapes: Sequence[Shape], rest: Sequence[ShapeFrame]) -> None:
@@ -263,38 +263,12 @@ def write_still(path: Path, *, scene: Scene, shapes: Sequence[Shape], rest: Sequ
         EnvironmentFailedError: the file cannot be written.
     """
     _require_writable(path.parent)
-    layer = Sdf.Layer.CreateAnonymous(".usdc")
-    stage = Usd.Stage.Open(layer)
-    define_rest(stage, scene=scene, shapes=shapes, rest=rest, provenance={}, texture_folder=path.parent / TEXTURES_NAME)
+    layer, world = Sdf.Layer.CreateAnonymous(".usdc"), World(scene, shapes, rest)
+    world.define_rest(layer, rest, {}, path.parent)
     for shape, sample in zip(shapes, rest, strict=True):
-        author_sample(layer, 0, shape, sample)
-    bounds = _bounds_of(rest)
-    _define_motion(stage, scene, shapes, bounds, bounds.mean(axis=0), 1, (0.0, 1.0))
+        world.author(layer, 0, shape, sample)
+    world.define_motion(Usd.Stage.Open(layer), 1, (0.0, 1.0))
     export_layer(layer, path)
-
-
-def _define_motion(
-    stage: Usd.Stage,
-    scene: Scene,
-    shapes: Sequence[Shape],
-    bounds: np.ndarray,
-    rest_center: np.ndarray,
-    frame_count: int,
-    force_range: tuple[float, float],
-) -> None:
-    """Write what depends on the motion: time range, legend, colliders and camera; lengths in m, forces in N."""
-    stage.SetStartTimeCode(0)
-    stage.SetEndTimeCode(max(frame_count - 1, 0))
-    world = stage.OverridePrim(WORLD)
-    world.SetCustomDataByKey("legend", legend(shapes, force_range))
-    define_colliders(stage, scene, bounds, rest_center)
-    define_camera(stage, scene, bounds)
-
-
-def _bounds_of(samples: Sequence[ShapeFrame]) -> np.ndarray:
-    """Return the lowest and the highest corner of the box around all points, float64 [2, 3], m."""
-    points = np.concatenate([sample.points for sample in samples]).astype(np.float64)
-    return np.stack([points.min(axis=0), points.max(axis=0)])
 
 
 def _require_writable(folder: Path) -> None:

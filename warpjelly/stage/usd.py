@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from ..meshes import LoadedModel
 
 FORCE = "primvars:force"
+NORMALS = "primvars:normals"
 COLOR = "primvars:displayColor"
 COLOR_INDICES = "primvars:displayColor:indices"
 
@@ -101,13 +102,13 @@ def declare_samples(layer: Sdf.Layer, shapes: Iterable[Shape], scene: Scene, *, 
     for shape in shapes:
         prim = Sdf.CreatePrimInLayer(layer, shape_path(shape))
         varying = {"points": types.Point3fArray, "extent": types.Float3Array}
-        if shape.name == SURFACE:
-            varying[_normals_name(shape)] = types.Normal3fArray
+        if name := normals_name(shape):
+            varying[name] = types.Normal3fArray
         if scene.output.velocities:
             varying["velocities"] = types.Vector3fArray
-        if shape.kinds is None and scene.output.color == "rgb":
+        if shape.shows_force and scene.output.color == "rgb":
             varying[COLOR] = types.Color3fArray
-        elif shape.kinds is None:
+        elif shape.shows_force:
             varying[COLOR_INDICES] = types.IntArray
         if forces:
             varying[FORCE] = types.FloatArray
@@ -115,39 +116,39 @@ def declare_samples(layer: Sdf.Layer, shapes: Iterable[Shape], scene: Scene, *, 
             Sdf.AttributeSpec(prim, name, kind)
 
 
-def author_sample(layer: Sdf.Layer, index: int, shape: Shape, sample: ShapeFrame) -> np.ndarray:
-    """Write what is declared of a shape at one frame, but for colours; return its extent [2, 3], m."""
+def author_sample(layer: Sdf.Layer, time: float, shape: Shape, sample: ShapeFrame) -> np.ndarray:
+    """Write what is declared of a shape at a time code, but for colours; return its extent [2, 3]."""
     if sample.points.shape != (len(shape.particles), 3):
         raise ValueError(f"{shape.body}: points {sample.points.shape} for a shape of {len(shape.particles)}")
     points = vectors(sample.points)
     samples = {"points": points, "extent": _extent(shape, points)}
-    if shape.name == SURFACE:
-        samples[_normals_name(shape)] = vectors(sample.normals)
+    if name := normals_name(shape):
+        samples[name] = vectors(sample.normals)
     prim = layer.GetPrimAtPath(shape_path(shape))
     if "velocities" in prim.properties:
         samples["velocities"] = vectors(sample.velocities)
     if FORCE in prim.properties:
         samples[FORCE] = Vt.FloatArray.FromNumpy(np.ascontiguousarray(sample.forces, np.float32))
     for name, value in samples.items():
-        layer.SetTimeSample(prim.path.AppendProperty(name), index, value)
+        layer.SetTimeSample(prim.path.AppendProperty(name), time, value)
     return np.array(samples["extent"])
 
 
 def author_colors(
-    layer: Sdf.Layer, index: int, shape: Shape, forces: np.ndarray, force_range: tuple[float, float]
+    layer: Sdf.Layer, time: float, shape: Shape, forces: np.ndarray, force_range: tuple[float, float]
 ) -> None:
-    """Write the colours of a shape at one frame, as they are declared; none where they don't show forces.
+    """Write the colours of a shape at a time code, as they are declared; none where they don't show forces.
 
     Args:
         layer: where the samples of the shape are declared.
-        index: number of the frame.
+        time: the time code.
         shape: the shape.
         forces: magnitudes [point_count], N.
         force_range: forces at both ends of the colour map, N.
     """
     for name in (COLOR, COLOR_INDICES):
         if layer.GetAttributeAtPath(path := shape_path(shape).AppendProperty(name)):
-            layer.SetTimeSample(path, index, _colors(name, forces, force_range))
+            layer.SetTimeSample(path, time, _colors(name, forces, force_range))
 
 
 def colors_in_range(
@@ -175,6 +176,8 @@ def _colors(name: str, forces: np.ndarray, force_range: tuple[float, float]) -> 
 
 def shape_path(shape: Shape) -> Sdf.Path:
     """Return where a shape is in the stage."""
+    if shape.prim is not None:
+        return Sdf.Path(shape.prim)
     return BODIES.AppendChild(shape.body).AppendChild(shape.name)
 
 
@@ -186,9 +189,11 @@ def _extent(shape: Shape, points: Vt.Vec3fArray) -> Vt.Vec3fArray:
     return UsdGeom.Points.ComputeExtent(points, Vt.FloatArray(len(points), shape.width))
 
 
-def _normals_name(shape: Shape) -> str:
-    """Return the attribute that holds the normals: those that corners choose from have indices, as a primvar."""
-    return "normals" if shape.corner_normals is None else "primvars:normals"
+def normals_name(shape: Shape) -> str | None:
+    """Return the attribute with the normals, if any: those that corners choose from have indices, as a primvar."""
+    if shape.corner_normals is not None:
+        return NORMALS
+    return "normals" if shape.name == SURFACE and shape.prim is None else None
 
 
 def _define_world(stage: Usd.Stage, scene: Scene, provenance: Mapping[str, object]) -> None:
@@ -197,11 +202,12 @@ def _define_world(stage: Usd.Stage, scene: Scene, provenance: Mapping[str, objec
     stage.SetDefaultPrim(world)
     Usd.ModelAPI(world).SetKind(Kind.Tokens.assembly)
     Usd.ModelAPI(world).SetAssetName(scene.name)
-    world.SetCustomDataByKey("provenance", {key: _storable(value) for key, value in provenance.items()})
+    world.SetCustomDataByKey("provenance", {key: storable(value) for key, value in provenance.items()})
     Usd.ModelAPI(UsdGeom.Xform.Define(stage, BODIES)).SetKind(Kind.Tokens.group)
 
 
-def _storable(value: object) -> object:
+def storable(value: object) -> object:
+    """Return what stands for a value in custom data: itself, or JSON where USD cannot store it."""
     if isinstance(value, np.generic):
         value = value.item()
     return value if isinstance(value, str | bool | int | float) else json.dumps(value, default=str)

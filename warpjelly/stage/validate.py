@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
 
 from ..errors import reason
-from .stagefiles import open_stage
+from .stagefiles import open_stage, overridden, silent_usd
 
 # The newest crate version that common viewers open.
 MAX_CRATE_VERSION = (0, 8, 0)
@@ -21,16 +21,19 @@ _EXTENT_TOLERANCE = 1e-5
 def stage_problems(path: Path) -> list[str]:
     """Return what is wrong with a stage file or the stage of a run directory, one line each; none if it is sound.
 
-    A problem that several samples share is listed once, with the first of them.
+    A problem that several samples share is listed once, with the first of them. Of a shot that a run has written over
+    only the meshes that it has moved are looked at, and what USD's own validators do not say of the shot alone.
 
     Raises:
         InputError: there is no such file, or it is not a USD file.
     """
     stage = open_stage(path)
     found: list[str] = []
+    over = overridden(stage)
     try:
-        for check in (_files, _usd_validators, _metadata, _structure, _shapes):
-            found += check(stage)
+        with silent_usd():
+            for check in (_layers, _own_problems, _metadata, _over_shapes) if over else _CHECKS:
+                found += check(stage)
     except Tf.ErrorException as error:
         found.append(f"the file is damaged: {reason(error)}")
     return found
@@ -39,11 +42,27 @@ def stage_problems(path: Path) -> list[str]:
 def _shapes(stage: Usd.Stage) -> Iterator[str]:
     for prim in stage.Traverse():
         if prim.IsA(UsdGeom.Gprim):
-            samples_with: dict[str, list[float | None]] = {}
-            for time, problem in _shape(stage, prim):
-                samples_with.setdefault(problem, []).append(time)
-            for problem, times in samples_with.items():
-                yield f"{prim.GetPath()}: {problem}{_located(times)}"
+            yield from _summed_up(prim, _shape(stage, prim))
+
+
+def _over_shapes(stage: Usd.Stage) -> Iterator[str]:
+    for path in overridden(stage):
+        prim = stage.GetPrimAtPath(path)
+        if not prim.IsA(UsdGeom.Mesh):
+            yield f"{path}: no mesh is there any more, so its motion is not seen"
+            continue
+        times = UsdGeom.Mesh(prim).GetPointsAttr().GetTimeSamples()
+        problems = ((time, problem) for time in times for problem in _sample(UsdGeom.Mesh(prim), Usd.TimeCode(time)))
+        yield from _summed_up(prim, problems)
+
+
+def _summed_up(prim: Usd.Prim, problems: Iterable[tuple[float | None, str]]) -> Iterator[str]:
+    """List each of the problems of a prim once, with the first of the samples that have it."""
+    samples_with: dict[str, list[float | None]] = {}
+    for time, problem in problems:
+        samples_with.setdefault(problem, []).append(time)
+    for problem, times in samples_with.items():
+        yield f"{prim.GetPath()}: {problem}{_located(times)}"
 
 
 def _located(times: list[float | None]) -> str:
@@ -56,7 +75,17 @@ def _located(times: list[float | None]) -> str:
 
 def _files(stage: Usd.Stage) -> Iterator[str]:
     """Check the files that the stage is made of: format version, and paths that break when the stage moves."""
-    for layer in stage.GetUsedLayers():
+    yield from _sound_files(stage.GetUsedLayers())
+
+
+def _layers(stage: Usd.Stage) -> Iterator[str]:
+    """Check the files of a run over a shot, but not those of the shot."""
+    folder = Path(stage.GetRootLayer().realPath).parent
+    yield from _sound_files(layer for layer in stage.GetUsedLayers() if folder in Path(layer.realPath).parents)
+
+
+def _sound_files(layers: Iterable[Sdf.Layer]) -> Iterator[str]:
+    for layer in layers:
         if not layer.realPath:
             continue
         with open(layer.realPath, "rb") as file:
@@ -89,6 +118,17 @@ def _usd_validators(stage: Usd.Stage) -> Iterator[str]:
     for error in context.Validate(stage):
         if not error.HasNoError():
             yield f"{error.GetMessage()} ({error.GetIdentifier()})"
+
+
+def _own_problems(stage: Usd.Stage) -> Iterator[str]:
+    """Return what USD says of a run over a shot, but not of the shot alone."""
+    root = stage.GetRootLayer()
+    known = set()
+    for path in root.subLayerPaths[-1:]:
+        shot = Sdf.Layer.FindOrOpen(root.ComputeAbsolutePath(path))
+        # Some of the problems name the stage.
+        known = {problem.replace(shot.identifier, root.identifier) for problem in _usd_validators(Usd.Stage.Open(shot))}
+    yield from (problem for problem in _usd_validators(stage) if problem not in known)
 
 
 def _metadata(stage: Usd.Stage) -> Iterator[str]:
@@ -224,3 +264,6 @@ def _primvar(primvar: UsdGeom.Primvar, code: Usd.TimeCode, sizes: dict[str, int]
     interpolation = primvar.GetInterpolation()
     if interpolation in sizes and count != sizes[interpolation] * primvar.GetElementSize():
         yield f"{count} {name} ({interpolation}) where there should be {sizes[interpolation]}"
+
+
+_CHECKS = (_files, _usd_validators, _metadata, _structure, _shapes)
