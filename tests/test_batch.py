@@ -562,7 +562,8 @@ def test_the_live_display_shows_the_batch_and_every_worker(base):
         last = terminal.getvalue()[len(shown) :]
         assert "k[1]: it diverged" in last
         assert "k2: finished" not in last
-        assert "5/5 runs (1 failed)" in last
+        assert re.search(r"5/5 runs \(1 failed\), [\d,]+ frames/s, 0:00 left", last)
+        assert live.frames_done == 4 + 10
 
 
 def test_unforeseen_errors_are_told_and_logged(base, tmp_path, monkeypatch):
