@@ -175,7 +175,7 @@ def test_one_run_at_a_time_writes_into_a_directory(tmp_path):
     process = start_run(tmp_path, "--set=duration=1000.0")
     wait_for(tmp_path, process, 1)
     for options in ({}, {"force": True}, {"resume": True}):
-        with pytest.raises(InputError, match=f"process {process.pid} is writing a run into this folder"):
+        with pytest.raises(InputError, match=f"process {process.pid} is writing into this folder"):
             simulate(small_scene(), output=tmp_path, device="cpu", **options)
     process.kill()
     process.communicate()

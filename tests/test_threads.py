@@ -16,7 +16,7 @@ from reference import World
 from test_integrators import ENERGIES, ORDERS, make_rough_world
 from worlds import make_material, make_scene, make_voxels
 
-from warpjelly import parts, team
+from warpjelly import machine, parts, team
 from warpjelly.cells import Cells
 from warpjelly.lattice import build_lattice
 from warpjelly.network import build_cloth
@@ -269,11 +269,11 @@ def test_cores_are_those_that_the_process_may_use(
     quota: str, expected: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Count the cores that the process is bound to, or what its control group leaves of them."""
-    monkeypatch.setattr(team.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
-    monkeypatch.setattr(team, "CPU_QUOTA", tmp_path / "cpu.max")
-    assert team.available_cores() == 8
+    monkeypatch.setattr(machine.os, "sched_getaffinity", lambda _: set(range(8)), raising=False)
+    monkeypatch.setattr(machine, "CPU_QUOTA", tmp_path / "cpu.max")
+    assert machine.available_cores() == 8
     (tmp_path / "cpu.max").write_text(quota + "\n")
-    assert team.available_cores() == expected
+    assert machine.available_cores() == expected
 
 
 def test_no_threads_are_refused() -> None:

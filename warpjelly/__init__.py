@@ -16,6 +16,8 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from .batch.batch import Batch, RunsFailedError, run_batch
+    from .batch.sweep import Sweep
     from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
     from .run import Run, simulate
     from .scene import Scene
@@ -24,26 +26,34 @@ if TYPE_CHECKING:
 
 # Loaded at first use, so that the command line answers at once.
 _HOMES = {
+    "Batch": "batch.batch",
     "DivergedError": "errors",
     "EnvironmentFailedError": "errors",
     "InputError": "errors",
     "Run": "run",
+    "RunsFailedError": "batch.batch",
     "Scene": "scene",
     "Simulator": "simulator",
+    "Sweep": "batch.sweep",
     "WarpjellyError": "errors",
     "load_scene": "scenefile",
+    "run_batch": "batch.batch",
     "simulate": "run",
 }
 
 __all__ = [
+    "Batch",
     "DivergedError",
     "EnvironmentFailedError",
     "InputError",
     "Run",
+    "RunsFailedError",
     "Scene",
     "Simulator",
+    "Sweep",
     "WarpjellyError",
     "load_scene",
+    "run_batch",
     "simulate",
 ]
 

@@ -29,10 +29,10 @@ from warpjelly.kernels import springs
 from .device import choose_device
 from .errors import InputError
 from .files import missing
+from .machine import available_cores
 from .scene import Scene
 from .simulator import Simulator
 from .stepping import Stepper
-from .team import available_cores
 
 log = logging.getLogger("warpjelly")
 

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import json
+import os
 import platform
 import zipfile
 from collections import defaultdict
@@ -130,17 +132,38 @@ def _contents(path: Path) -> dict[str, str]:
         # Where a model has moved with all that is beside it, nothing has changed.
         place = file.parent.resolve() / file.name
         name = place.relative_to(folder).as_posix() if place.is_relative_to(folder) else file.name
-        with open(file, "rb") as content:
-            digests[name].append(hashlib.file_digest(content, "sha256").hexdigest()[:16])
+        about = os.stat(file)
+        digests[name].append(_digest(file, about.st_size, about.st_mtime_ns)[:16])
     return {
         "" if name == path.name else f" {name}": f"{name} (SHA-256 {', '.join(found)})"
         for name, found in digests.items()
     }
 
 
+@functools.lru_cache(maxsize=1000)
+def _digest(path: Path, size: int, time: int) -> str:
+    """Return the SHA-256 of a file; the runs of a batch share models. A file that has changed has another time."""
+    with open(path, "rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def scene_hash(scene: Scene) -> str:
+    """Return what tells the results of a scene, made by this version, from any others; the name does not matter."""
+    keys = {key: value for key, value in scene_keys(scene).items() if key != "name"}
+    expect = scene.expect.model_dump(mode="json", exclude_none=True)
+    told = {"scene": keys, "frames": scene.frame_count, "expect": expect, "version": version_of("warpjelly")}
+    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()
+
+
+@functools.cache
+def version_of(package: str) -> str:
+    """Return the version of an installed package; looking for it takes milliseconds."""
+    return metadata.version(package)
+
+
 def origin_of(device: str) -> dict[str, str]:
     """Return what decides the last bits of a result besides the scene."""
-    versions = {name: metadata.version(name) for name in _PACKAGES}
+    versions = {name: version_of(name) for name in _PACKAGES}
     return {"device": device, "machine": platform.machine(), **versions}
 
 

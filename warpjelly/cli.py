@@ -9,7 +9,6 @@ import re
 import signal
 import sys
 import tomllib
-import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from operator import itemgetter
@@ -18,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from .errors import EnvironmentFailedError, InputError, SceneError, WarpjellyError, listed
+from .errors import InputError, SceneError, WarpjellyError, listed, verdict
 
 if TYPE_CHECKING:
     from .expect import Outcome
@@ -151,6 +150,102 @@ def run(
         print(json.dumps(result.record, allow_nan=False))
     elif not quiet:
         _summarize(result.record, result.outcomes)
+    if ended is not None:
+        sys.stdout.flush()
+        raise ended
+
+
+@app.command()
+def batch(
+    specs: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="SPEC...", help="Sweep file, scene files, or folders of scene files.", show_default=False
+        ),
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "-o",
+            "--output",
+            help="Folder of the batch, with a run directory for each run; outputs/<name of the sweep> unless given.",
+            show_default=False,
+        ),
+    ] = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, help="Runs at a time; as many as GPUs, or cores, unless given.", show_default=False),
+    ] = None,
+    device: DeviceOption = "auto",
+    frames: Annotated[
+        int | None, typer.Option(min=1, help="Number of samples instead of the scenes'.", show_default=False)
+    ] = None,
+    settings: SetOption = [],  # noqa: B006
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="List the runs and what they take, and do nothing.")
+    ] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on with a batch: do only what is missing, unfinished or failed.")
+    ] = False,
+    force: Annotated[
+        bool,
+        typer.Option(
+            "--force", help="Replace runs that are there already; with --resume only those of other scenes or versions."
+        ),
+    ] = False,
+    as_json: JsonOption = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress and no summary.")] = False,
+) -> None:
+    """Simulate many scenes, or one scene with many values of some keys.
+
+    A sweep file names a base scene and what its keys are to be; each combination of values is a run:
+
+    \b
+        base = "cube.toml"
+        \\[vary]
+        "materials.jelly.structural.stiffness" = [50, 100, 200]
+        "bodies.cube.position.1" = { range = [0.5, 2.0], count = 4 }
+
+    Runs that fail do not disturb the others: the exit code is 3 then. batch.json and batch.csv in the folder of the
+    batch have parameters, figures and stage of each run, or why it failed; run.log in its run directory has what it
+    said. A run whose process was lost is begun once more. Ctrl-C ends the runs that are under way after their current
+    frame, and --resume goes on.
+    """  # noqa: D301 -- \b keeps lines as they are
+    from .batch.batch import BatchInterruptedError, RunsFailedError, estimate_batch, run_batch
+    from .batch.display import display, list_runs, summarize
+
+    if dry_run:
+        with _progress("building") as show:
+            estimate = estimate_batch(
+                specs,
+                overrides=_overrides(settings),
+                frames=frames,
+                workers=workers,
+                device=device,
+                progress=show,
+            )
+        print(json.dumps(estimate, allow_nan=False, default=str)) if as_json else list_runs(estimate)
+        return
+    ended: WarpjellyError | None = None
+    with display(quiet=quiet) as watcher:
+        try:
+            done = run_batch(
+                specs,
+                output=output,
+                overrides=_overrides(settings),
+                frames=frames,
+                workers=workers,
+                device=device,
+                resume=resume,
+                force=force,
+                watcher=watcher,
+            )
+        except (BatchInterruptedError, RunsFailedError) as error:
+            ended, done = error, error.batch
+    if as_json:
+        print(json.dumps(done.record, allow_nan=False, default=str))
+    elif not quiet:
+        summarize(done)
     if ended is not None:
         sys.stdout.flush()
         raise ended
@@ -485,7 +580,7 @@ def doctor() -> None:
     import warp as wp
 
     from .device import start_warp
-    from .memory import memory_limit
+    from .machine import memory_limit
 
     start_warp()
     print(f"warpjelly {metadata.version('warpjelly')} on Python {platform.python_version()}, {platform.platform()}")
@@ -550,8 +645,6 @@ def _guarded() -> int:
     """Run a command and return its exit code; whatever goes wrong becomes one line on stderr."""
     try:
         return int(app(prog_name="warpjelly", standalone_mode=False) or 0)
-    except WarpjellyError as error:
-        return _fail(str(error), error.exit_code)
     except typer.TyperException as error:
         # Without arguments the help was shown, and there is nothing to add.
         if not (message := error.format_message().rstrip(".")):
@@ -559,25 +652,12 @@ def _guarded() -> int:
         context = getattr(error, "ctx", None)
         hint = f"; see '{context.command_path} --help'" if context is not None else ""
         return _fail(f"{message}{hint}", error.exit_code)
-    except KeyboardInterrupt:
-        return _fail("interrupted", 130)
     except BrokenPipeError:
         # Whoever read our output has gone, as `| head` does; writing a message would only fail again.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 141
-    except MemoryError:
-        return _fail("out of memory; lower the resolution or the particles per edge", EnvironmentFailedError.exit_code)
-    except OSError as error:
-        return _fail(str(error), EnvironmentFailedError.exit_code)
-    except Exception as error:
-        if os.environ.get("WARPJELLY_TRACEBACK"):
-            traceback.print_exc()
-        place = traceback.extract_tb(error.__traceback__)[-1]
-        return _fail(
-            f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); please "
-            "report it as CONTRIBUTING.md says, with the output of a run with WARPJELLY_TRACEBACK=1",
-            EnvironmentFailedError.exit_code,
-        )
+    except (Exception, KeyboardInterrupt) as error:
+        return _fail(*verdict(error))
 
 
 def _fail(message: str, exit_code: int) -> int:

@@ -41,6 +41,12 @@ def choose_device(name: str = "auto") -> str:
     return name
 
 
+def gpus() -> list[str]:
+    """Return the Warp names of all GPUs."""
+    start_warp()
+    return [str(device) for device in wp.get_cuda_devices()]
+
+
 @contextmanager
 def _stderr_logged() -> Iterator[None]:
     """Send what native code writes to stderr to the log."""

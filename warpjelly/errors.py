@@ -2,8 +2,17 @@
 
 from __future__ import annotations
 
+import difflib
+import os
 import re
-from collections.abc import Sequence
+import traceback
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+# What Warp says where the system has no memory for an array.
+NO_MEMORY = "Failed to allocate"
+# Exit code of what was interrupted: that of a shell's Ctrl-C.
+INTERRUPTED = 130
 
 
 class WarpjellyError(Exception):
@@ -34,6 +43,29 @@ class EnvironmentFailedError(WarpjellyError):
     exit_code = 4
 
 
+def verdict(error: BaseException) -> tuple[str, int]:
+    """Return what to tell people of whatever went wrong, in one line, and the exit code."""
+    if isinstance(error, WarpjellyError):
+        message, code = str(error), error.exit_code
+    elif isinstance(error, KeyboardInterrupt):
+        message, code = "interrupted", INTERRUPTED
+    elif isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(NO_MEMORY)):
+        message = "out of memory; lower the resolution or the particles per edge"
+        code = EnvironmentFailedError.exit_code
+    elif isinstance(error, OSError):
+        message, code = str(error), EnvironmentFailedError.exit_code
+    else:
+        place = traceback.extract_tb(error.__traceback__)[-1]
+        message = (
+            f"internal error: {type(error).__name__}: {error} ({Path(place.filename).name}:{place.lineno}); please "
+            "report it as CONTRIBUTING.md says, with the output of a run with WARPJELLY_TRACEBACK=1"
+        )
+        code = EnvironmentFailedError.exit_code
+        if os.environ.get("WARPJELLY_TRACEBACK"):
+            traceback.print_exception(error)
+    return " ".join(message.split()), code
+
+
 def reason(error: Exception) -> str:
     """Return what an error of USD says first, without the place in USD's source that reports it."""
     said = re.search(r" : '(.*?)'\s*$", str(error), re.MULTILINE)
@@ -44,3 +76,9 @@ def listed(names: Sequence[str], most: int) -> str:
     """Return names for a message, and how many more there are."""
     rest = len(names) - most
     return ", ".join(names[:most]) + (f" and {rest} more" if rest > 0 else "")
+
+
+def suggestion(word: str, known: Iterable[str], what: str = "known") -> str:
+    """Return what may have been meant by a word that is not known, or all that is."""
+    close = difflib.get_close_matches(word, known := list(known), n=1)
+    return f"did you mean '{close[0]}'?" if close else f"{what}: {', '.join(known)}"

@@ -97,7 +97,7 @@ def locked(folder: Path) -> Iterator[None]:
                 fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
             except BlockingIOError as error:
                 file.seek(0)
-                raise InputError(f"{folder}: process {file.read() or '?'} is writing a run into this folder") from error
+                raise InputError(f"{folder}: process {file.read() or '?'} is writing into this folder") from error
             # Whoever had the lock before may just have removed the file, and a third process have made another one.
             if path.exists() and os.stat(path).st_ino == os.fstat(file.fileno()).st_ino:
                 break

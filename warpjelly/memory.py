@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from warpjelly.kernels.integrators import STAGES
@@ -114,12 +112,3 @@ def _passing_bytes(bodies: Sequence[BodyPlan], scene: Scene) -> float:
 def seeks_limits(springs: int, steps: int, evaluations: int) -> bool:
     """Say whether a run of so many springs and steps looks for the largest stable step, by so many evaluations."""
     return evaluations * springs <= LIMIT_SPRINGS or evaluations <= LIMIT_SHARE * steps
-
-
-def memory_limit() -> float:
-    """Return how much memory this process may use, bytes: that of the machine or of its control group."""
-    limit = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if hasattr(os, "sysconf") else float("inf")
-    group = Path("/sys/fs/cgroup/memory.max")
-    if group.is_file() and (text := group.read_text().strip()).isdigit():
-        limit = min(limit, float(text))
-    return limit

@@ -18,6 +18,7 @@ from warpjelly.kernels.lattices import MAX_MATERIALS
 from .cells import Cells
 from .errors import SceneError, listed
 from .lattice import Lattice, build_lattice, count_lattice
+from .machine import memory_limit
 from .memory import (
     BYTES_PER_BUILT_PARTICLE,
     BYTES_PER_BUILT_SPAN,
@@ -28,7 +29,6 @@ from .memory import (
     MAX_ROW_BYTES,
     PROGRAM_BYTES,
     body_bytes,
-    memory_limit,
     peak_bytes,
 )
 from .network import build_cloth, build_network

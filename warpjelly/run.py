@@ -4,15 +4,11 @@ from __future__ import annotations
 
 import logging
 import platform
-import signal
-import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack, closing
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import numpy as np
@@ -20,8 +16,17 @@ import numpy as np
 from warpjelly.kernels.integrators import STAGES
 
 from .background import Background
-from .checkpoint import Checkpoint, differences, origin_of, restore_state, scene_keys, state_arrays
-from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
+from .checkpoint import (
+    Checkpoint,
+    differences,
+    origin_of,
+    restore_state,
+    scene_hash,
+    scene_keys,
+    state_arrays,
+    version_of,
+)
+from .errors import INTERRUPTED, DivergedError, EnvironmentFailedError, InputError, WarpjellyError
 from .expect import Observer, Outcome
 from .files import locked
 from .memory import COPIED_BYTES, seeks_limits
@@ -41,6 +46,7 @@ from .rundir import (
 from .scene import Scene
 from .shapes import SURFACE, ShapeFrame
 from .shot import Shot
+from .signals import interruptions
 from .simulator import Simulator
 from .stability import evaluations
 from .stage.stagefiles import find_stage
@@ -214,6 +220,7 @@ def _simulate_into(
     forces = max(frames - max(done, 1), 0) * sim.substeps * stages
     record = {
         "scene": scene.name,
+        "scene_hash": scene_hash(scene),
         "stage": str(find_stage(folder)),
         "run_dir": str(folder),
         "frames": frames,
@@ -240,7 +247,7 @@ def _simulate_into(
         raise RunEndedError(str(ended), run, ended.exit_code) from ended
     if ended is not None:
         what = f"interrupted after {frames} of {scene.frame_count} frames, which are in {folder}; go on with --resume"
-        raise RunEndedError(what, run, 130) from ended
+        raise RunEndedError(what, run, INTERRUPTED) from ended
     return run
 
 
@@ -258,7 +265,7 @@ def _simulate_frames(
     """
     first, total = writer.frame_count, sim.scene.frame_count
     stepping = 0.0
-    with Background(FRAMES_IN_FLIGHT) as background, _interruptions() as interrupted:
+    with Background(FRAMES_IN_FLIGHT) as background, interruptions() as interrupted:
         try:
             for index in range(first, total):
                 if index > 0:
@@ -294,31 +301,6 @@ def _changing_arrays(sim: Simulator, observer: Observer) -> tuple[dict[str, np.n
     arrays = {f"{owner}.{name}": array for owner, group in parts.items() for name, array in group.items()}
     copied = sum(array.nbytes for array in arrays.values()) <= COPIED_BYTES
     return {name: array.copy() for name, array in arrays.items()} if copied else arrays, copied
-
-
-@contextmanager
-def _interruptions() -> Iterator[Callable[[], bool]]:
-    """Give a function that says whether Ctrl-C was pressed, or the like; a second time it interrupts as ever."""
-    asked = threading.Event()
-
-    def ask(number: int, frame: FrameType | None) -> None:
-        asked.set()
-        signal.signal(number, signal.default_int_handler)
-
-    ours = [number for number in (signal.SIGINT, signal.SIGTERM) if _interrupts(number)]
-    for number in ours:
-        signal.signal(number, ask)
-    try:
-        yield asked.is_set
-    finally:
-        for number in ours:
-            signal.signal(number, signal.default_int_handler)
-
-
-def _interrupts(number: int) -> bool:
-    """Say whether a signal raises KeyboardInterrupt here; only the main thread may change that."""
-    in_main = threading.current_thread() is threading.main_thread()
-    return in_main and signal.getsignal(number) is signal.default_int_handler
 
 
 def forecast(scene: Scene, *, device: str = "auto", threads: int | None = None) -> dict[str, Any]:
@@ -392,7 +374,7 @@ def provenance(scene: Scene, sim: Simulator) -> dict[str, Any]:
     packages = ("warpjelly", "warp-lang", "numpy", "usd-core", "trimesh")
     return {
         "resolved_scene": scene.model_dump(mode="json", exclude_none=True) | {"gravity": scene.gravity_vector.tolist()},
-        "versions": {"python": platform.python_version()} | {name: metadata.version(name) for name in packages},
+        "versions": {"python": platform.python_version()} | {name: version_of(name) for name in packages},
         "machine": platform.machine(),
         "device": sim.device,
     }

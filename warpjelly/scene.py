@@ -6,7 +6,6 @@ A scene is TOML. Each class here is one table of it; field descriptions carry un
 
 from __future__ import annotations
 
-import difflib
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,7 +32,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from .cells import Cells
-from .errors import SceneError
+from .errors import SceneError, suggestion
 from .files import missing
 from .gridfile import read_grid
 
@@ -92,8 +91,7 @@ class Table(BaseModel):
             return data
         for key in data:
             if key not in cls.model_fields:
-                close = difflib.get_close_matches(str(key), cls.model_fields, n=1)
-                hint = f"did you mean '{close[0]}'?" if close else f"known keys: {', '.join(cls.model_fields)}"
+                hint = suggestion(str(key), cls.model_fields, "known keys")
                 raise PydanticCustomError("unknown_key", "{hint}", {"hint": hint, "key": str(key)})
         return data
 

@@ -34,14 +34,14 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         data = read_world(path)
         overrides = settle_time(path, data, overrides)
     else:
-        data = _read_toml(path)
+        data = read_toml(path)
     for key, value in overrides.items():
-        _override(data, key, value)
+        _override(data, key, value, path)
     if frames is not None:
         data.pop("duration", None)
         data["frames"] = frames
         data.pop("expect", None)
-    data.setdefault("name", _identifier(path.stem))
+    data.setdefault("name", identifier(path.stem))
     return read_scene(data, path)
 
 
@@ -58,10 +58,15 @@ def read_scene(data: dict[str, Any], path: Path) -> Scene:
     try:
         return Scene.model_validate(data, context={"folder": path.parent})
     except ValidationError as error:
-        raise InputError(f"{path}: {_explain(error)}") from error
+        raise InputError(f"{path}: {explain(error, Scene)}") from error
 
 
-def _read_toml(path: Path) -> dict[str, Any]:
+def read_toml(path: Path) -> dict[str, Any]:
+    """Read a TOML file.
+
+    Raises:
+        InputError: it cannot be read, or is not TOML.
+    """
     hint = ""
     if path.suffix.lower() != ".toml":
         hint = "; a scene is a .toml or a .w file, which names models and is not one itself"
@@ -78,26 +83,26 @@ def _read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot read the scene: {error.strerror}{hint}") from error
 
 
-def _override(data: dict[str, Any], key: str, value: Any) -> None:
+def _override(data: dict[str, Any], key: str, value: Any, path: Path) -> None:
     """Set a dotted key in nested tables and lists, making tables on the way."""
     *parents, last = key.split(".")
     node: Any = data
     for part in parents:
         if isinstance(node, list):
-            node = node[_entry(node, part, key)]
+            node = node[_entry(node, part, f"{path}: {key}")]
         elif isinstance(node, dict):
             node = node.setdefault(part, {})
         else:
-            raise InputError(f"--set {key}: '{part}' is inside a value that is not a table")
+            raise InputError(f"{path}: {key}: '{part}' is inside a value that is not a table")
     if isinstance(node, list):
-        node[_entry(node, last, key)] = value
+        node[_entry(node, last, f"{path}: {key}")] = value
     elif isinstance(node, dict):
         node[last] = value
     else:
-        raise InputError(f"--set {key}: '{last}' is inside a value that is not a table")
+        raise InputError(f"{path}: {key}: '{last}' is inside a value that is not a table")
 
 
-def _entry(entries: list[Any], part: str, key: str) -> int:
+def _entry(entries: list[Any], part: str, what: str) -> int:
     """Return the position of a list entry given by its number or its name, also one that it gets for having none."""
     names = [
         entry.get("name", f"{entry.get('type')}_{i}") if isinstance(entry, dict) else None
@@ -108,11 +113,11 @@ def _entry(entries: list[Any], part: str, key: str) -> int:
     if part in (numbers := [str(i) for i in range(len(entries))]):
         return numbers.index(part)
     known = ", ".join([f"0 to {len(entries) - 1}", *(name for name in names if name)]) if entries else "none"
-    raise InputError(f"--set {key}: no entry '{part}'; entries: {known}")
+    raise InputError(f"{what}: no entry '{part}'; entries: {known}")
 
 
-def _identifier(text: str) -> str:
-    """Turn a file name into a valid scene name."""
+def identifier(text: str) -> str:
+    """Turn a file name into a valid name of a scene."""
     name = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in text)[:63]
     return name if name and not name[0].isdigit() else f"_{name}"
 
@@ -129,8 +134,8 @@ _WORDS = {
 }
 
 
-def _explain(error: ValidationError) -> str:
-    """Say in one line what is wrong with the scene first: key, value, what is allowed."""
+def explain(error: ValidationError, root: type[Table]) -> str:
+    """Say in one line what is wrong first with a file of such tables: key, value, what is allowed."""
     problems = error.errors(include_url=False)
     first = problems[0]
     context = first.get("ctx", {})
@@ -155,9 +160,9 @@ def _explain(error: ValidationError) -> str:
         *parents, _ = first["loc"]
         lacking = sum(problem["type"] == "missing" and list(problem["loc"][:-1]) == parents for problem in problems)
         needed = f"must have {len(value) + lacking} entries, not {len(value)}"
-        return f"{_key(tuple(parents))} = {_shown(value)}: {needed}{_described(tuple(parents))}"
+        return f"{_key(tuple(parents))} = {_shown(value)}: {needed}{_described(tuple(parents), root)}"
     elif first["type"] == "missing":
-        message = f"{key}: missing; this key is required{_described(first['loc'])}"
+        message = f"{key}: missing; this key is required{_described(first['loc'], root)}"
     elif first["type"] == "union_tag_not_found":
         message = f"{key}.type: missing; this key is required"
     elif first["type"] == "union_tag_invalid":
@@ -167,7 +172,7 @@ def _explain(error: ValidationError) -> str:
     elif isinstance(value, Mapping):
         message = f"{key}: {what}"
     else:
-        message = f"{key} = {_shown(value)}: {what}{_described(first['loc'])}"
+        message = f"{key} = {_shown(value)}: {what}{_described(first['loc'], root)}"
     others = len(problems) - 1 - len(tried)
     return message + (f" (and {others} more)" if others else "")
 
@@ -180,9 +185,9 @@ def _key(location: tuple[int | str, ...]) -> str:
     return ".".join(part for part in parts if "[" not in part and not part.startswith(("literal", "constrained")))
 
 
-def _described(location: tuple[int | str, ...]) -> str:
+def _described(location: tuple[int | str, ...], root: type[Table]) -> str:
     """Return the description of the field at an error, in brackets."""
-    tables: list[type[Table]] = [Scene]
+    tables = [root]
     description = None
     for part in location:
         if fields := [table.model_fields[part] for table in tables if part in table.model_fields]:

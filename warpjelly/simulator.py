@@ -14,6 +14,7 @@ from warpjelly.kernels import diagnostics, shapes
 
 from .device import choose_device
 from .errors import DivergedError, SceneError
+from .machine import available_cores
 from .model import Model, State, build
 from .plan import Plan, plan_scene
 from .scene import MAX_SUBSTEPS, Scene
@@ -30,7 +31,6 @@ from .stability import (
     step_limits,
 )
 from .stepping import MAX_CAPTURED_SUBSTEPS, Stepper, capture_lock
-from .team import available_cores
 
 steps = logging.getLogger("warpjelly.steps")
 

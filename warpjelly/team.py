@@ -3,28 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-import math
 import os
 from concurrent.futures import Future, ThreadPoolExecutor
-from pathlib import Path
 from typing import Any
 
 import warp as wp
 
 from warpjelly.kernels.turns import Turn
-
-# What a control group allows its processes: time of processors per period, "max" for no limit, and the period.
-CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
-
-
-def available_cores() -> int:
-    """Return how many cores this process may use: those that it is bound to, but no more than its control group has."""
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    if CPU_QUOTA.is_file():
-        quota, period = CPU_QUOTA.read_text().split()
-        if quota != "max":
-            cores = min(cores, math.ceil(int(quota) / int(period)))
-    return cores
 
 
 def _give_way() -> int:

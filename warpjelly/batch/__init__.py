@@ -1,0 +1,1 @@
+"""Many runs: what they are, who does them, what came of them."""
