@@ -20,6 +20,11 @@ def available_cores() -> int:
     return cores
 
 
+def threads_of(workers: int) -> int:
+    """Return how many threads each of some processes may have that share the cores."""
+    return max(1, available_cores() // workers)
+
+
 def memory_limit() -> float:
     """Return how much memory this process may use, bytes: that of the machine or of its control group."""
     limit = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")) if hasattr(os, "sysconf") else float("inf")

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 from ..errors import WarpjellyError
-from ..machine import memory_limit
+from ..machine import memory_limit, threads_of
 from ..plan import CLIP_FRAMES, plan_scene
 from ..run import forecast
 from ..scene import Scene
@@ -44,7 +44,7 @@ class Estimator:
             raise known
         return known
 
-    def forecast(self, scene: Scene, *, device: str) -> dict[str, Any]:
+    def forecast(self, scene: Scene, *, device: str, threads: int | None = None) -> dict[str, Any]:
         """Return ``particles, springs, frames, memory_bytes, seconds`` of a run.
 
         Raises:
@@ -52,12 +52,12 @@ class Estimator:
         """
         if scene.solver.dt == "auto":
             # Then all of the scene decides how many substeps there are.
-            figures = forecast(scene, device=device)
+            figures = forecast(scene, device=device, threads=threads)
             share = 1.0
         else:
             key = _structure(scene)
             if key not in self._forecasts:
-                self._forecasts[key] = scene, forecast(scene, device=device)
+                self._forecasts[key] = scene, forecast(scene, device=device, threads=threads)
             first, figures = self._forecasts[key]
             share = _substeps(scene) / _substeps(first)
         names = ("particles", "springs", "memory_bytes")
@@ -112,7 +112,7 @@ def estimate(
         problem = entry.problem
         if entry.scene is not None:
             try:
-                figures = estimator.forecast(entry.scene, device=device)
+                figures = estimator.forecast(entry.scene, device=device, threads=threads_of(workers))
             except WarpjellyError as error:
                 problem = f"{entry.source}: {error}"
         about = {"name": entry.name, "source": entry.source, "parameters": entry.parameters, "problem": problem}

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from ..device import choose_device, gpus
 from ..errors import INTERRUPTED, EnvironmentFailedError
-from ..machine import available_cores, memory_limit
+from ..machine import available_cores, memory_limit, threads_of
 from .jobs import Job, Result, Watcher
 
 # A job whose process was lost is begun so often in all.
@@ -92,7 +92,7 @@ class _Crew:
     def __init__(self, devices: Sequence[str], count: int) -> None:
         self._waiting: list[_Attempt] = []
         self._inbox: queue.SimpleQueue[tuple[_Worker, Any]] = queue.SimpleQueue()
-        threads = max(1, available_cores() // count)
+        threads = threads_of(count)
         self._workers = [
             _Worker(str(number + 1), devices[number % len(devices)], threads, self._inbox) for number in range(count)
         ]
