@@ -1,4 +1,4 @@
-"""Fixtures and the home of the markers ``egl`` and ``browser``."""
+"""Fixtures and the home of the markers ``egl``, ``browser`` and ``cluster``."""
 
 from __future__ import annotations
 
@@ -28,10 +28,11 @@ def precision(request: pytest.FixtureRequest) -> str:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip marked tests where what they need is missing, unless WARPJELLY_REQUIRE_EGL=1 or ..._BROWSER=1 forbids it."""
+    """Skip marked tests where what they need is missing, unless WARPJELLY_REQUIRE_EGL=1 or the like forbids it."""
     for marker, is_there, reason in (
         ("egl", _has_egl, "offscreen OpenGL does not work here"),
         ("browser", _has_browser, "no Chromium here"),
+        ("cluster", _has_ray, "no Ray here"),
     ):
         marked = [item for item in items if item.get_closest_marker(marker)]
         if not marked or os.environ.get(f"WARPJELLY_REQUIRE_{marker.upper()}") == "1" or is_there():
@@ -42,6 +43,10 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _has_browser() -> bool:
     return chromium() is not None and util.find_spec("playwright") is not None
+
+
+def _has_ray() -> bool:
+    return util.find_spec("ray") is not None
 
 
 def _has_egl() -> bool:

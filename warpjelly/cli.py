@@ -177,6 +177,17 @@ def batch(
         typer.Option(min=1, help="Runs at a time; as many as GPUs, or cores, unless given.", show_default=False),
     ] = None,
     device: DeviceOption = "auto",
+    engine: Annotated[
+        Literal["local", "ray"], typer.Option(help="Processes on this machine, or a Ray cluster that it is part of.")
+    ] = "local",
+    address: Annotated[
+        str | None,
+        typer.Option(
+            metavar="HOST:PORT",
+            help="Of the Ray cluster; that of RAY_ADDRESS, or of this machine, unless given.",
+            show_default=False,
+        ),
+    ] = None,
     frames: Annotated[
         int | None, typer.Option(min=1, help="Number of samples instead of the scenes'.", show_default=False)
     ] = None,
@@ -214,6 +225,14 @@ def batch(
     from .batch.batch import BatchInterruptedError, RunsFailedError, estimate_batch, run_batch
     from .batch.display import display, list_runs, summarize
 
+    if engine == "ray":
+        from .batch.cluster import RayEngine
+
+        chosen = RayEngine(address=address, workers=workers, device=device)
+    elif address is not None:
+        raise InputError("--address is that of a Ray cluster: add --engine ray")
+    else:
+        chosen = None
     if dry_run:
         with _progress("building") as show:
             estimate = estimate_batch(
@@ -222,6 +241,7 @@ def batch(
                 frames=frames,
                 workers=workers,
                 device=device,
+                engine=chosen,
                 progress=show,
             )
         print(json.dumps(estimate, allow_nan=False, default=str)) if as_json else list_runs(estimate)
@@ -236,6 +256,7 @@ def batch(
                 frames=frames,
                 workers=workers,
                 device=device,
+                engine=chosen,
                 resume=resume,
                 force=force,
                 watcher=watcher,
@@ -598,6 +619,7 @@ def doctor() -> None:
         ("preview", ["pyvista", "PIL", "imageio_ffmpeg", "matplotlib"]),
         ("formats", ["lxml", "networkx", "collada"]),
         ("bench", ["newton", "numba", "taichi"]),
+        ("cluster", ["ray"]),
     ]:
         missing = "" if all(map(util.find_spec, modules)) else f"missing: pip install 'warpjelly[{extra}]'"
         print(f"  {extra:<10} {missing or 'present'}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -104,7 +105,30 @@ def locked(folder: Path) -> Iterator[None]:
         file.truncate(0)
         file.write(str(os.getpid()))
         file.flush()
+        # Where other machines see the folder, they are to see this, too.
+        os.fsync(file.fileno())
         try:
             yield
         finally:
             path.unlink(missing_ok=True)
+
+
+def wait_for_lock(folder: Path, patience: float) -> None:
+    """Wait until no other process has the lock of a folder, or the folder is not there.
+
+    Args:
+        folder: the folder.
+        patience: for so long at most, s.
+
+    Raises:
+        InputError: then, another process still has the lock.
+    """
+    until = time.monotonic() + patience
+    while (folder / LOCK_NAME).exists():
+        try:
+            with locked(folder):
+                return
+        except InputError:
+            if time.monotonic() > until:
+                raise
+            time.sleep(0.1)

@@ -142,6 +142,7 @@ def estimate_batch(
     frames: int | None = None,
     workers: int | None = None,
     device: str = "auto",
+    engine: Engine | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
 ) -> dict[str, Any]:
     """Say which runs a batch has and what they take; for arguments see ``run_batch``, for the result ``estimate``.
@@ -152,8 +153,12 @@ def estimate_batch(
     from .estimate import estimate
 
     entries = read_specs(_listed(specs), overrides=overrides, frames=frames)
-    engine = LocalEngine(workers=workers, device=device)
-    return estimate(entries, workers=engine.workers, device=device, progress=progress)
+    if engine is None:
+        count = LocalEngine(workers=workers, device=device).workers
+    else:
+        with engine:
+            count = engine.workers
+    return estimate(entries, workers=count, device=device, progress=progress)
 
 
 def _listed(specs: Spec | Sequence[Spec]) -> list[Spec]:

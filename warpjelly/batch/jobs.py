@@ -53,6 +53,9 @@ class Watcher:
     def end(self, worker: str, job: Job, result: Result) -> None:
         """A worker has ended a job."""
 
+    def say(self, line: str) -> None:
+        """Something that people should know."""
+
 
 class Engine(Protocol):
     """Does jobs somewhere; used in a ``with`` block, at whose start it gets ready."""
@@ -63,7 +66,7 @@ class Engine(Protocol):
     """How many jobs it does at a time."""
 
     def __enter__(self) -> Self:
-        """Get ready, without waiting until it is."""
+        """Get ready to do jobs, so far that what cannot be is found out."""
         ...
 
     def __exit__(self, *_: object) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..checkpoint import scene_hash, version_of
 from ..errors import InputError, verdict
-from ..files import LOCK_NAME, locked
+from ..files import wait_for_lock
 from ..rundir import RECORD_NAME, read_record, write_record
 from ..scene import Scene
 from .estimate import Estimator
@@ -138,14 +138,7 @@ def _wait_for_orphans(folders: Sequence[Path]) -> None:
     """Wait a moment for workers of a batch that was killed to notice it and end."""
     until = time.monotonic() + LOCK_PATIENCE
     for folder in folders:
-        while (folder / LOCK_NAME).exists():
-            try:
-                with locked(folder):
-                    pass
-            except InputError:
-                if time.monotonic() > until:
-                    raise
-                time.sleep(0.1)
+        wait_for_lock(folder, until - time.monotonic())
 
 
 def _find_finished(folder: Path, hashes: Mapping[str, str]) -> set[str]:
