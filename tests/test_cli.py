@@ -339,12 +339,12 @@ def test_a_scene_that_cannot_be_built_is_named(warpjelly, tmp_path, setting, sai
     assert (code, str(scene) in one_line(err)) == (2, False)
 
 
-@pytest.mark.parametrize("output", ["file", "file/below"])
-def test_an_output_that_cannot_be_written_exits_with_4(warpjelly, tmp_path, output):
+@pytest.mark.parametrize(("output", "expected"), [("file", 2), ("file/below", 4)])
+def test_an_output_that_cannot_be_written_is_refused(warpjelly, tmp_path, output, expected):
     """Say in one line which folder cannot be written."""
     (tmp_path / "file").write_text("")
     code, out, err = warpjelly("run", CUBE, "--frames", 2, "-o", tmp_path / output)
-    assert (code, out) == (4, "")
+    assert (code, out) == (expected, "")
     assert str(tmp_path / output) in one_line(err)
     assert (tmp_path / "file").read_text() == ""
 
