@@ -88,9 +88,10 @@ def test_memory_is_estimated(tmp_path: Path, kind: str) -> None:
     """Plan what memory a scene takes, and how much more another one does.
 
     It is within 10 % where the machine has nothing else to do. With other work beside, a frame may be written before
-    the next one is simulated, so that the two do not add up: the peak was 11 % below what was planned. Repeated, the same difference was measured 4 % more or less, as allocators keep what is freed; numbers of spans are
-    estimates themselves, which left up to 4 %. What a kind is about is more than a quarter of its
-    difference, so that nothing can be left out; but the spans of the law "young" are too few of any to be told apart.
+    the next one is simulated, so that the two do not add up: the peak was 11 % below what was planned. Repeated, the
+    same difference was measured 4 % more or less, as allocators keep what is freed; numbers of spans are estimates
+    themselves, which left up to 4 %. What a kind is about is more than a quarter of its difference, so that nothing can
+    be left out; but the spans of the law "young" are too few of any to be told apart.
     """
     runs = []
     for number, scene in enumerate(make_pair(tmp_path, kind)):
