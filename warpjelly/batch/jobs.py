@@ -53,6 +53,9 @@ class Watcher:
     def end(self, worker: str, job: Job, result: Result) -> None:
         """A worker has ended a job."""
 
+    def draw(self, done: int, total: int) -> None:
+        """All jobs have ended, and pictures of so many of the runs are drawn."""
+
 
 class Engine(Protocol):
     """Does jobs somewhere; used in a ``with`` block, at whose start it gets ready."""

@@ -5,8 +5,6 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 
-from ..scene import Scene
-
 WORLD = Sdf.Path("/World")
 BODIES = WORLD.AppendChild("bodies")
 COLLIDERS = WORLD.AppendChild("colliders")
@@ -80,12 +78,12 @@ def bind_look(shape: UsdGeom.Gprim, look: str) -> None:
     binding.CreateRelationship(UsdShade.Tokens.materialBinding, custom=False).SetTargets([LOOKS.AppendChild(look)])
 
 
-def facing(direction: tuple[float, float, float], scene: Scene) -> np.ndarray:
-    """Return the axes (right, up, backward) [3, 3] of a camera or light that looks from a direction."""
+def facing(direction: tuple[float, float, float], up_axis: str) -> np.ndarray:
+    """Return the axes (right, up, backward) [3, 3] of what looks from a direction, which is given for Y up."""
     x, y, z = direction
-    backward = np.array([x, y, z] if scene.up_axis == "Y" else [x, -z, y])
+    backward = np.array([x, y, z] if up_axis == "Y" else [x, -z, y])
     backward /= np.linalg.norm(backward)
-    right = np.cross(np.eye(3)[scene.up], backward)
+    right = np.cross(np.eye(3)["XYZ".index(up_axis)], backward)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(backward, right), backward])
 

@@ -92,8 +92,13 @@ def define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:
             if np.linalg.norm(center - np.clip(center, *bounds)) < collider.radius + diagonal / 2:
                 low = np.minimum(low, center - collider.radius)
                 high = np.maximum(high, center + collider.radius)
-    axes = facing(_CAMERA_DIRECTION, scene)
-    x, y, z = axes @ np.array(list(np.ndindex(2, 2, 2)) * (high - low) + low).T
+    corners = np.array(list(np.ndindex(2, 2, 2))) * (high - low) + low
+    aim_camera(UsdGeom.Camera.Define(stage, CAMERA), facing(_CAMERA_DIRECTION, scene.up_axis), corners)
+
+
+def aim_camera(camera: UsdGeom.Camera, axes: np.ndarray, points: np.ndarray) -> None:
+    """Place a camera with given axes [3, 3] as close as it sees all points [count, 3], m."""
+    x, y, z = axes @ points.T
     # In the axes of the camera, a corner is seen from (X, Y, Z) while |x - X| <= s (Z - z), with s the slope of the
     # frustum's sides; the closest place that sees all follows from the outermost corner on each side.
     placed = []
@@ -104,7 +109,6 @@ def define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:
     back = max(placed[0][1], placed[1][1], z.max() + 1e-3)
     distance = back - (z.max() + z.min()) / 2
 
-    camera = UsdGeom.Camera.Define(stage, CAMERA)
     camera.CreateFocalLengthAttr(_FOCAL_LENGTH)
     camera.CreateHorizontalApertureAttr(_APERTURE[0])
     camera.CreateVerticalApertureAttr(_APERTURE[1])
