@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import os
+import queue
 import re
 import resource
 import signal
@@ -14,11 +15,11 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import pytest
+import warp as wp
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from runs import CUBE, samples_of
@@ -31,7 +32,8 @@ from warpjelly.batch.jobs import Job, Result, Watcher
 from warpjelly.batch.perform import perform
 from warpjelly.batch.pool import LocalEngine
 from warpjelly.batch.sweep import Sweep
-from warpjelly.errors import EnvironmentFailedError, InputError
+from warpjelly.errors import EnvironmentFailedError, InputError, verdict
+from warpjelly.machine import available_cores
 from warpjelly.scenefile import load_scene
 from warpjelly.stage.validate import stage_problems
 
@@ -350,6 +352,13 @@ def test_a_run_that_exhausts_memory_leaves_the_others_alone(base, tmp_path, star
     assert (cli.folder / runs["k120"]["log"]).read_text()
 
 
+def test_an_array_that_warp_has_no_memory_for_is_out_of_memory():
+    """Ask Warp for more than any machine has, and read what people are told."""
+    with pytest.raises(RuntimeError) as error:
+        wp.empty((2**30, 2**20), dtype=wp.float64, device="cpu")
+    assert verdict(error.value) == ("out of memory; lower the resolution or the particles per edge", 4)
+
+
 def test_two_batches_do_not_share_a_folder(base, tmp_path, start):
     """Try a second batch while one is going: it is refused, and the first one goes on."""
     sweep = write_sweep(tmp_path, base, [50, 100], {**SMALL, "frames": 100_000})
@@ -404,17 +413,63 @@ def test_a_run_that_diverged_is_done_again_and_fails_again(base, tmp_path):
         assert [run["status"] for run in error.value.batch.record["runs"]] == ["finished", "failed"]
 
 
-def test_no_more_runs_at_a_time_than_memory_takes(base, tmp_path, monkeypatch):
-    """Have memory for one run at a time, and find the runs one after another with three workers."""
-    monkeypatch.setattr(pool, "memory_limit", lambda: 400e6)
-    run_batch(make_sweep(base, [50, 100, 150, 200]), output=tmp_path / "out", device="cpu", workers=3)
-    # The times in the logs sort as texts.
-    spans = sorted(
-        (re.search(r"^(\S+ \S+) INFO: begun", log, re.MULTILINE)[1], re.search(r"(\S+ \S+) INFO: finished", log)[1])
-        for log in (path.read_text() for path in (tmp_path / "out").glob("*/run.log"))
-    )
-    assert len(spans) == 4
-    assert all(before[1] <= after[0] for before, after in pairwise(spans))
+class Idle:
+    """A worker that never does anything; what it would be told is noted."""
+
+    def __init__(self, name: str, device: str, threads: int, inbox: queue.SimpleQueue[Any]) -> None:
+        self.name, self.inbox = name, inbox
+        self.attempt, self.leaving, self.gone = None, False, False
+
+    def begin(self, attempt: Any) -> None:
+        """Take a job."""
+        self.attempt = attempt
+
+    def end(self, crew: Any) -> None:
+        """End the job well, and have that heard."""
+        self.inbox.put((self, Result(self.attempt.job.name, 0, None)))
+        assert len(list(crew.listen(Watcher()))) == 1
+
+
+def make_crew(monkeypatch: pytest.MonkeyPatch, base: Path, sizes: list[float]) -> tuple[Any, Callable[[], list[Any]]]:
+    """Return three idle workers with jobs of so many bytes, and a function that says which they have."""
+    monkeypatch.setattr(pool, "_Worker", Idle)
+    crew = pool._Crew(["cpu"], 3)
+    scene = load_scene(base, overrides=SMALL)
+    crew.take([Job(str(number), scene, Path(str(number)), int(size)) for number, size in enumerate(sizes)])
+
+    def under_way() -> list[Any]:
+        crew.give_out()
+        return [worker.attempt and worker.attempt.job.name for worker in crew._workers]
+
+    return crew, under_way
+
+
+def test_the_first_run_is_alone_until_it_has_a_frame(base, monkeypatch):
+    """Give out three jobs: the first one compiles what is not compiled yet, the others follow."""
+    crew, under_way = make_crew(monkeypatch, base, [1, 1, 1])
+    assert under_way() == ["0", None, None]
+    assert under_way() == ["0", None, None]
+    crew._inbox.put((crew._workers[0], 1))
+    assert list(crew.listen(Watcher())) == []
+    assert under_way() == ["0", "1", "2"]
+
+
+def test_no_more_runs_at_a_time_than_memory_takes(base, monkeypatch):
+    """Have 10 bytes, and jobs of 6, 5, 4, 20 and 3: what fits is begun, and what never fits is tried alone."""
+    monkeypatch.setattr(pool, "memory_limit", lambda: 10.0)
+    crew, under_way = make_crew(monkeypatch, base, [6, 5, 4, 20, 3])
+    crew._fanned_out = True
+    assert under_way() == ["0", "2", None]
+    crew._workers[0].end(crew)
+    assert under_way() == ["1", "2", None]
+    crew._workers[1].end(crew)
+    assert under_way() == ["1", "4", None]
+    crew._workers[0].end(crew)
+    assert under_way() == [None, "4", None]
+    crew._workers[1].end(crew)
+    assert under_way() == ["3", None, None]
+    crew._workers[0].end(crew)
+    assert not crew.is_busy()
 
 
 def test_a_script_needs_no_special_shape(base, tmp_path):
@@ -532,4 +587,4 @@ def test_an_engine_gives_its_gpus_to_the_workers_in_turn(monkeypatch):
     assert (engine.devices, engine.workers) == (["cuda:0", "cuda:1"], 2)
     assert LocalEngine(workers=5).workers == 5
     assert LocalEngine(workers=5, most=3).workers == 3
-    assert LocalEngine(device="cpu").workers == len(os.sched_getaffinity(0))
+    assert LocalEngine(device="cpu").workers == available_cores()

@@ -16,7 +16,7 @@ import importlib
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from .batch.batch import Batch, run_batch
+    from .batch.batch import Batch, RunsFailedError, run_batch
     from .batch.sweep import Sweep
     from .errors import DivergedError, EnvironmentFailedError, InputError, WarpjellyError
     from .run import Run, simulate
@@ -31,6 +31,7 @@ _HOMES = {
     "EnvironmentFailedError": "errors",
     "InputError": "errors",
     "Run": "run",
+    "RunsFailedError": "batch.batch",
     "Scene": "scene",
     "Simulator": "simulator",
     "Sweep": "batch.sweep",
@@ -46,6 +47,7 @@ __all__ = [
     "EnvironmentFailedError",
     "InputError",
     "Run",
+    "RunsFailedError",
     "Scene",
     "Simulator",
     "Sweep",

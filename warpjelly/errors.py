@@ -9,6 +9,8 @@ import traceback
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+# What Warp says where the system has no memory for an array.
+NO_MEMORY = "Failed to allocate"
 # Exit code of what was interrupted: that of a shell's Ctrl-C.
 INTERRUPTED = 130
 
@@ -47,7 +49,7 @@ def verdict(error: BaseException) -> tuple[str, int]:
         message, code = str(error), error.exit_code
     elif isinstance(error, KeyboardInterrupt):
         message, code = "interrupted", INTERRUPTED
-    elif isinstance(error, MemoryError):
+    elif isinstance(error, MemoryError) or (isinstance(error, RuntimeError) and str(error).startswith(NO_MEMORY)):
         message = "out of memory; lower the resolution or the particles per edge"
         code = EnvironmentFailedError.exit_code
     elif isinstance(error, OSError):

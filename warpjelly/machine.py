@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
+# What a control group allows its processes: time of processors per period, "max" for no limit, and the period.
+CPU_QUOTA = Path("/sys/fs/cgroup/cpu.max")
 
-def cpu_count() -> int:
-    """Return the number of processors that this process may use."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+def available_cores() -> int:
+    """Return how many cores this process may use: those that it is bound to, but no more than its control group has."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    if CPU_QUOTA.is_file():
+        quota, period = CPU_QUOTA.read_text().split()
+        if quota != "max":
+            cores = min(cores, math.ceil(int(quota) / int(period)))
+    return cores
 
 
 def memory_limit() -> float:

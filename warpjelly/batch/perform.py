@@ -42,18 +42,18 @@ def perform(job: Job, *, device: str, progress: Callable[[int, int], None] = lam
     """
     try:
         job.folder.mkdir(parents=True, exist_ok=True)
-        resume = job.resume and resumable(job.folder, job.scene)
         with _logged(job.folder / LOG_NAME, append=job.resume):
-            return _perform(job, device, resume, progress)
+            return _perform(job, device, progress)
     except OSError as error:
         why = f"{job.folder}: cannot write the log of the run: {error.strerror or error}"
         return Result(job.name, EnvironmentFailedError.exit_code, why)
 
 
-def _perform(job: Job, device: str, resume: bool, progress: Callable[[int, int], None]) -> Result:
-    log.info("%s in process %d", "going on" if resume else "begun", os.getpid())
+def _perform(job: Job, device: str, progress: Callable[[int, int], None]) -> Result:
     began = time.perf_counter()
     try:
+        resume = job.resume and resumable(job.folder, job.scene)
+        log.info("%s in process %d", "going on" if resume else "begun", os.getpid())
         simulate(job.scene, output=job.folder, device=device, force=not resume, resume=resume, progress=progress)
     except (Exception, KeyboardInterrupt) as error:
         why, code = verdict(error)

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 from ..device import choose_device, gpus
 from ..errors import INTERRUPTED, EnvironmentFailedError
-from ..machine import cpu_count, memory_limit
+from ..machine import available_cores, memory_limit
 from .jobs import Job, Result, Watcher
 
 # A job whose process was lost is begun so often in all.
@@ -47,7 +47,7 @@ class LocalEngine:
 
     def __init__(self, *, workers: int | None = None, device: str = "auto", most: int | None = None) -> None:
         self.devices = (gpus() if device == "auto" else []) or [choose_device(device)]
-        count = workers or (cpu_count() if self.devices == ["cpu"] else len(self.devices))
+        count = workers or (available_cores() if self.devices == ["cpu"] else len(self.devices))
         self.workers = count if most is None else min(count, most)
         self._crew: _Crew | None = None
 
@@ -92,7 +92,7 @@ class _Crew:
     def __init__(self, devices: Sequence[str], count: int) -> None:
         self._waiting: list[_Attempt] = []
         self._inbox: queue.SimpleQueue[tuple[_Worker, Any]] = queue.SimpleQueue()
-        threads = max(1, cpu_count() // count)
+        threads = max(1, available_cores() // count)
         self._workers = [
             _Worker(str(number + 1), devices[number % len(devices)], threads, self._inbox) for number in range(count)
         ]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -66,7 +67,7 @@ def _stage_of(folder: Path, own: Path) -> str | None:
         return None
 
 
-def _figures(own: Path, record: Mapping[str, Any]) -> dict[str, float]:
+def _figures(own: Path, record: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the numbers that tell runs apart, by name; SI units.
 
     What a scene expects of itself is measured, so ``[expect]`` decides which quantities there are.
@@ -82,7 +83,8 @@ def _figures(own: Path, record: Mapping[str, Any]) -> dict[str, float]:
         figures[name] = max(float(row[name]) for row in rows)
     for name in _LAST if rows else ():
         figures[name] = float(rows[-1][name])
-    return figures
+    # Of a run that is about to diverge, they need not be finite, and JSON has no other numbers.
+    return {name: value if math.isfinite(value) else None for name, value in figures.items()}
 
 
 def count(runs: Sequence[Mapping[str, Any]]) -> dict[str, int]:

@@ -22,7 +22,7 @@ from ..scene import Number, Positive, Table, refuse
 from ..scenefile import explain, read_toml
 
 # More runs than this would be a typing error.
-MAX_RUNS = 100_000
+MAX_RUNS = 10_000
 # Longer names would be unwieldy; file systems take 255 bytes.
 MAX_NAME = 100
 # Steps of ranges are rounded to so many digits, draws to so many: what is listed is what runs, and fits into names.

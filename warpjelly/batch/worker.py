@@ -44,7 +44,7 @@ def work(device: str) -> None:
         _send(messages, result)
         if result.exit_code == EnvironmentFailedError.exit_code:
             # After an error of the machine, or one that nobody thought of, a fresh process is the safer one.
-            return
+            os._exit(0)
 
 
 class _Reporter:
