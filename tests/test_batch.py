@@ -141,7 +141,8 @@ def start(tmp_path):
             if limit is not None:
                 resource.setrlimit(resource.RLIMIT_AS, (limit, limit))
 
-        command = [sys.executable, "-m", "warpjelly.cli", "batch", sweep, "-o", folder, "--device=cpu", *options]
+        told = ["-o", folder, "--device=cpu", "--no-pictures", *options]
+        command = [sys.executable, "-m", "warpjelly.cli", "batch", sweep, *told]
         pipe = subprocess.PIPE
         one_thread = dict.fromkeys(pool._THREADS, "1")
         process = subprocess.Popen(

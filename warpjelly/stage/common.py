@@ -86,8 +86,7 @@ def color_by(root: Usd.Prim, own: ForceRange, shared: ForceRange, frames: Sequen
         if color.IsIndexed():
             color.Set(vectors(table))
             continue
-        for frame in frames:
-            # Green rises all along the colour map.
-            green = np.array(color.Get(frame))[:, 1]
+        # Green rises all along the colour map. The first sample that is set hides those of weaker layers.
+        for frame, green in {frame: np.array(color.Get(frame))[:, 1] for frame in frames}.items():
             entries = np.rint(np.interp(green, LINEAR_TABLE[:, 1], np.arange(COLOR_COUNT))).astype(int)
             color.Set(vectors(table[entries]), frame)
