@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..colors import SRGB_TABLE
+from ..colors import SRGB_TABLE, range_in_words
 from ..errors import EnvironmentFailedError, InputError, WarpjellyError
 from ..files import whole_file
 from ..scene import Expect
@@ -140,7 +140,7 @@ def _groups(folder: Path, record: Mapping[str, Any]) -> dict[str, dict[str, Path
 def _page(folder: Path, record: Mapping[str, Any], thumbnails: Thumbnails | None, missing: str) -> str:
     strips = thumbnails.strips if thumbnails else {}
     problems = thumbnails.problems if thumbnails else {}
-    ranges = [forces for forces in (thumbnails.ranges if thumbnails else []) if forces is not None]
+    ranges = [range_in_words(forces) for forces in (thumbnails.ranges if thumbnails else []) if forces is not None]
     described = {
         "counts": record["counts"],
         "began": record["began"],
