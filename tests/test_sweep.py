@@ -187,7 +187,7 @@ def test_a_base_that_is_not_there_or_a_key_that_no_run_can_have_is_refused(tmp_p
     with pytest.raises(InputError, match=r"jello_cube.toml: solver.precison: unknown key; did you mean 'precision'\?"):
         read_specs([path])
     path = write_sweep(tmp_path, '[vary]\n"solver.dt" = [1e-3, 2e-3]')
-    with pytest.raises(InputError, match=r"sweep.toml: solver.dt: is what the sweep varies"):
+    with pytest.raises(InputError, match=r"sweep.toml: solver.dt: the sweep varies it"):
         read_specs([path], overrides={"solver.dt": 1e-4})
 
 
@@ -248,6 +248,13 @@ def test_the_sweep_of_the_readme_is_sound(tmp_path):
     entries = read_specs([tmp_path / "sweep.toml"])
     assert len(entries) == 4 * 3 * 2 * 3
     assert all(entry.problem is None for entry in entries)
+
+
+def test_the_sweeps_beside_the_scenes_are_sound():
+    """Read every one."""
+    paths = list((SCENES / "sweeps").glob("*.toml"))
+    assert paths
+    assert all(entry.problem is None for entry in read_specs(paths))
 
 
 def test_the_schema_for_editors_is_current():

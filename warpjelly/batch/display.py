@@ -59,8 +59,13 @@ class Lines(Watcher):
 
     def end(self, worker: str, job: Job, result: Result) -> None:
         """Write what came of a run."""
-        self._under_way.pop(worker, None)
-        self._frames += job.scene.frame_count
+        done = self._under_way.pop(worker, 0)
+        if result.exit_code == 0:
+            self._frames += job.scene.frame_count
+        else:
+            # The frames that there will not be took no time, and need none.
+            self._frames += done
+            self._all_frames -= job.scene.frame_count - done
         self._done += 1
         self._failed += result.exit_code != 0
         self.tell(job, result)

@@ -118,7 +118,7 @@ def _entries_of_sweep(sweep: Sweep, source: str, overrides: dict[str, Any], fram
     varied = {key: name for name, parameter in sweep.vary.items() for key in parameter.keys or [name]}
     for key in overrides:
         if key in varied:
-            raise InputError(f"{source}: {key}: is what the sweep varies as '{varied[key]}', and cannot be set as well")
+            raise InputError(f"{source}: {key}: the sweep varies it ('{varied[key]}'), so it cannot be set as well")
     try:
         names = run_names(sweep)
     except InputError as error:
