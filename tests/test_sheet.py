@@ -104,7 +104,7 @@ def test_page_tells_of_every_run(page) -> None:
     assert shown.get_attribute("#rows a", "href") == "broken/run.log"
     card = shown.locator(".card", has_text="broken")
     assert "diverged" in card.inner_text()
-    assert "1 of 1 expectations missed" in shown.locator(".card", has_text="k50_d0.5").inner_text()
+    assert "missed 1 of 1" in shown.locator(".card", has_text="k50_d0.5").inner_text()
     assert "were not drawn" in shown.inner_text("#missing")
 
 
@@ -313,9 +313,10 @@ def test_page_is_made_without_what_draws(drawn, monkeypatch, caplog, error) -> N
     described, pictures = contents(folder / "index.html")
     assert pictures == {}
     assert described["missing"] == f"No pictures: {error}; then warpjelly batch --resume draws them."
-    assert [line.getMessage() for line in caplog.records if line.levelname == "WARNING"] == [
-        f"{folder / 'index.html'} has no pictures: {error}"
-    ]
+    damage, said = [line.getMessage() for line in caplog.records if line.levelname == "WARNING"]
+    assert said == f"{folder / 'index.html'} has no pictures: {error}"
+    # One of the runs is damaged.
+    assert damage.startswith(f"no {folder / 'comparison.usda'}: {folder / 'damaged.usdc'}: not a readable USD file")
 
 
 def test_a_batch_leaves_page_and_comparison(tmp_path) -> None:

@@ -119,13 +119,15 @@ def compared(sources: Sequence[Path]) -> list[Compared]:
 
 
 def _compare(folder: Path, record: Mapping[str, Any]) -> None:
-    """Write the comparison of the first finished runs, or remove one that has become wrong."""
-    path = folder / COMPARISON_NAME
+    """Write the comparison of the first finished runs; where there are not two, remove that of an earlier batch."""
+    path, runs = folder / COMPARISON_NAME, finished_runs(folder, record)[:MOST_COMPARED]
     try:
-        write_comparison(finished_runs(folder, record)[:MOST_COMPARED], path)
+        if len(runs) > 1:
+            write_comparison(runs, path)
+            return
     except WarpjellyError as error:
-        path.unlink(missing_ok=True)
-        log.info("no %s: %s", path, error)
+        log.warning("no %s: %s", path, error)
+    path.unlink(missing_ok=True)
 
 
 def _groups(folder: Path, record: Mapping[str, Any]) -> dict[str, dict[str, Path]]:
