@@ -17,12 +17,14 @@ from PIL import Image
 from runs import CUBE
 from stages import cube_surface, make_scene, write_stage
 
+from warpjelly.batch import report, sheet
 from warpjelly.batch.batch import RunsFailedError, run_batch
 from warpjelly.batch.sheet import compared, present
 from warpjelly.batch.sweep import Sweep
 from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.previews import thumbnails
 from warpjelly.previews.thumbnails import SIZE, draw_thumbnails
+from warpjelly.scene import Expect
 from warpjelly.stage.stagefiles import open_stage
 from warpjelly.stage.validate import stage_problems
 
@@ -344,3 +346,10 @@ def test_a_batch_leaves_page_and_comparison(tmp_path) -> None:
     only = sweep.model_copy(update={"vary": {"k": sweep.vary["k"].model_copy(update={"values": [50]})}})
     run_batch(only, output=out, device="cpu", workers=1, resume=True)
     assert not (out / "comparison.usda").exists()
+
+
+def test_every_figure_has_a_meaning() -> None:
+    """Say of every figure that batch.json may have what it is, in which unit."""
+    of_runs = {*report._OF_RECORD, *report._GREATEST, *report._LAST}
+    assert of_runs == set(sheet._MEANINGS)
+    assert not of_runs & set(Expect.model_fields)

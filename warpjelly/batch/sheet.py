@@ -33,15 +33,8 @@ log = logging.getLogger("warpjelly")
 # A comparison that nobody asked for has so many runs at most.
 MOST_COMPARED = 64
 
+# What figures mean besides those of ``[expect]``, which come before; the page shows them in this order.
 _MEANINGS = {
-    "frames": "number of samples",
-    "particles": "number of particles",
-    "springs": "number of springs",
-    "voxels": "number of jelly cubes",
-    "substeps": "substeps a frame",
-    "dt": "time step, s",
-    "wall_seconds": "time that the run took, s",
-    "springs_per_second": "springs x force evaluations in a second of stepping, 1/s",
     "max_speed": "greatest particle speed over the run, m/s",
     "max_penetration": "greatest depth of a particle in a collider over the run, m",
     "max_overlap": "greatest depth of a particle in another body over the run, m",
@@ -53,6 +46,14 @@ _MEANINGS = {
     "contact_losses": "energy that contacts took, J",
     "friction_losses": "energy that friction took, J",
     "field_work": "energy that fields gave, J",
+    "frames": "number of samples",
+    "particles": "number of particles",
+    "springs": "number of springs",
+    "voxels": "number of jelly cubes",
+    "substeps": "substeps a frame",
+    "dt": "time step, s",
+    "wall_seconds": "time that the run took, s",
+    "springs_per_second": "springs x force evaluations in a second of stepping, 1/s",
 }
 
 
@@ -152,7 +153,7 @@ def _page(folder: Path, record: Mapping[str, Any], thumbnails: Thumbnails | None
         "times": thumbnails.times if thumbnails else [],
         "forces": ranges,
         "colors": np.rint(SRGB_TABLE[::15] * 255).astype(int).tolist(),
-        "meanings": _MEANINGS | {name: field.description for name, field in Expect.model_fields.items()},
+        "meanings": {name: field.description for name, field in Expect.model_fields.items()} | _MEANINGS,
         "runs": [
             {
                 **{key: run[key] for key in ("name", "status", "reason", "parameters", "figures", "stage", "log")},
