@@ -105,8 +105,8 @@ def test_page_tells_of_every_run(page) -> None:
     assert rows(shown)[6][2:] == ["1e9", "0.1", "1e9", "", "log ", "the simulation </script> diverged"]
     assert shown.get_attribute("#rows a", "href") == "broken/run.log"
     card = shown.locator(".card", has_text="broken")
-    assert "diverged" in card.inner_text()
-    assert "missed 1 of 1" in shown.locator(".card", has_text="k50_d0.5").inner_text()
+    assert "diverged" in card.text_content()
+    assert "missed 1 of 1" in shown.locator(".card", has_text="k50_d0.5").text_content()
     assert "were not drawn" in shown.inner_text("#missing")
 
 
@@ -202,7 +202,7 @@ def test_plot_shows_a_figure_against_a_parameter(page) -> None:
     assert shown.inner_text("#tip").split("\n") == ["k1000_d0.5", "bounce 26.62", "damping 0.5", "stiffness 1000"]
     shown.locator("circle").nth(5).click()
     assert shown.inner_text("tr.marked td") == "k1000_d0.5"
-    assert shown.inner_text(".card.marked b") == "k1000_d0.5"
+    assert shown.text_content(".card.marked b") == "k1000_d0.5"
     shown.keyboard.press("Escape")
     assert shown.locator(".marked").count() == 0
 
@@ -270,7 +270,7 @@ def test_pictures_are_made_to_be_compared(drawn, page) -> None:
     shown.on("pageerror", lambda error: page[1].append(str(error)))
     shown.goto((folder / "index.html").as_uri())
     assert shown.locator(".picture[role=img]").count() == 4
-    assert "not a readable USD file" in shown.locator(".card", has_text="damaged").inner_text()
+    assert "not a readable USD file" in shown.locator(".card", has_text="damaged").text_content()
     style = "span => getComputedStyle(span).backgroundPositionX"
     assert shown.eval_on_selector(".picture", style) == "0%"
     shown.locator("#time").press("End")
