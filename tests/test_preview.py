@@ -132,11 +132,18 @@ def test_hardest_impact_is_the_default(tmp_path: Path, color: str) -> None:
 
 @pytest.mark.egl
 def test_no_frame_shows_those_before(tmp_path: Path) -> None:
-    """Render a frame after others exactly as by itself, its shadow included."""
+    """Render a frame after others, and after another stage, exactly as by itself, its shadow included."""
     stage = open_stage(write_stage(tmp_path / "stage.usdc"))
-    with View(stage, SIZE) as view:
+    other = open_stage(write_stage(tmp_path / "other.usdc", meshes=[cube_surface(count=3, center=(2.0, 1.0, 0.0))]))
+    with View(SIZE) as view:
+        view.look_at(stage)
         after = [view.render(frame) for frame in (9, 0, 4)][-1]
-    with View(stage, SIZE) as view:
+        view.look_at(other)
+        view.render(0)
+        view.look_at(stage)
+        np.testing.assert_array_equal(view.render(4), after)
+    with View(SIZE) as view:
+        view.look_at(stage)
         np.testing.assert_array_equal(view.render(4), after)
 
 

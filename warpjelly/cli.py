@@ -204,6 +204,9 @@ def batch(
             "--force", help="Replace runs that are there already; with --resume only those of other scenes or versions."
         ),
     ] = False,
+    pictures: Annotated[
+        bool, typer.Option("--pictures/--no-pictures", help="Draw the finished runs for index.html.")
+    ] = True,
     as_json: JsonOption = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress and no summary.")] = False,
 ) -> None:
@@ -219,8 +222,9 @@ def batch(
 
     Runs that fail do not disturb the others: the exit code is 3 then. batch.json and batch.csv in the folder of the
     batch have parameters, figures and stage of each run, or why it failed; run.log in its run directory has what it
-    said. A run whose process was lost is begun once more. Ctrl-C ends the runs that are under way after their current
-    frame, and --resume goes on.
+    said. index.html shows the runs in any browser, comparison.usda side by side in a USD viewer. A run whose
+    process was lost is begun once more. Ctrl-C ends the runs that are under way after their current frame, and --resume
+    goes on.
     """  # noqa: D301 -- \b keeps lines as they are
     from .batch.batch import BatchInterruptedError, RunsFailedError, estimate_batch, run_batch
     from .batch.display import display, list_runs, summarize
@@ -259,6 +263,7 @@ def batch(
                 engine=chosen,
                 resume=resume,
                 force=force,
+                pictures=pictures,
                 watcher=watcher,
             )
         except (BatchInterruptedError, RunsFailedError) as error:
@@ -445,6 +450,37 @@ def pack(
     refuse_to_replace(output, force=force)
     pack_stage(source, output)
     print(f"stage: {output}")
+
+
+@app.command()
+def compare(
+    sources: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="RUN_OR_STAGE_OR_BATCH...",
+            help="Run directories, stages, or folders of batches, which stand for all their finished runs.",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Stage to write, .usda.", show_default=False)],
+    columns: Annotated[
+        int | None,
+        typer.Option(min=1, help="Runs in a row; about as many as rows unless given.", show_default=False),
+    ] = None,
+    force: Annotated[bool, typer.Option("--force", help="Replace a file that is there already.")] = False,
+) -> None:
+    """Show runs side by side in one stage, all from their start, with colours that mean the same forces.
+
+    The stage refers to those of the runs by relative paths, so they may be moved together.
+    """
+    from .batch.sheet import compared
+    from .files import refuse_to_replace
+    from .stage.comparison import write_comparison
+
+    refuse_to_replace(output, force=force)
+    runs = compared(sources)
+    write_comparison(runs, output, columns=columns)
+    print(f"stage: {output}, with {len(runs)} runs side by side")
 
 
 @app.command()

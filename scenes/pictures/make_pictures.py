@@ -1,8 +1,11 @@
 """Make the pictures of the README: run each scene and show some of its frames side by side, and one as a movie.
 
 python scenes/pictures/make_pictures.py [SCENE ...]
+
+"sheet" is the page of a batch, in the Chromium that is installed.
 """
 
+import shutil
 import sys
 import tempfile
 from pathlib import Path
@@ -15,6 +18,7 @@ from warpjelly.previews.preview import render_preview
 HERE = Path(__file__).parent
 SIZE, MOVIE_SIZE = (420, 236), (800, 450)
 GAP = 4
+SHEET_SIZE = {"width": 1100, "height": 920}
 # The frames that tell a scene's story.
 FRAMES = {
     "tree_drop": [0, 25, 38, 78, 299],
@@ -59,6 +63,26 @@ def main(chosen: list[str]) -> None:
                     show(scene, [frame], panel)
                 side_by_side([Image.open(panel) for panel in panels]).save(HERE / f"{name}.png")
             print(HERE / f"{name}.png")
+    if not chosen or "sheet" in chosen:
+        show_sheet(HERE / "sheet.png")
+        print(HERE / "sheet.png")
+
+
+def show_sheet(picture: Path) -> None:
+    """Do the parameter study and write its page, as a browser shows it, into a PNG."""
+    from playwright.sync_api import sync_playwright
+
+    with tempfile.TemporaryDirectory() as folder, sync_playwright() as playwright:
+        output = Path(folder) / "bounce"
+        wj.run_batch(HERE.parent / "sweeps" / "bounce.toml", output=output, pictures=True)
+        browser = playwright.chromium.launch(executable_path=shutil.which("chromium"), args=["--no-sandbox"])
+        page = browser.new_page(viewport=SHEET_SIZE, color_scheme="light")
+        page.goto((output / "index.html").as_uri())
+        page.select_option("#y", label="bounce")
+        page.screenshot(path=picture)
+        browser.close()
+    # Few colours make a small file.
+    Image.open(picture).convert("RGB").quantize(256).save(picture, optimize=True)
 
 
 def side_by_side(panels: list[Image.Image]) -> Image.Image:

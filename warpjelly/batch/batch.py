@@ -61,6 +61,7 @@ def run_batch(
     engine: Engine | None = None,
     resume: bool = False,
     force: bool = False,
+    pictures: bool = False,
     watcher: Watcher | None = None,
 ) -> Batch:
     """Simulate many scenes, each into a run directory of its own. A run that fails does not disturb the others.
@@ -77,6 +78,7 @@ def run_batch(
         resume: go on with a batch: do only what is missing or failed. Runs are finished if scene and version are the
             same, whatever they were called then.
         force: replace runs that are there already; with ``resume``, only those that are of other scenes or versions.
+        pictures: draw the finished runs for index.html, which loads VTK into this process.
         watcher: hears how it goes.
 
     Raises:
@@ -97,7 +99,7 @@ def run_batch(
         with locked(folder):
             if not (resume or force):
                 _refuse_to_replace(folder, entries)
-            batch = _run(folder, entries, engine, watcher or Watcher(), resume=resume, force=force)
+            batch = _run(folder, entries, engine, watcher or Watcher(), resume=resume, force=force, pictures=pictures)
     except OSError as error:
         raise EnvironmentFailedError(f"{folder}: cannot write the batch: {error.strerror or error}") from error
     if batch.record["counts"]["failed"]:
@@ -116,11 +118,19 @@ def _refuse_to_replace(folder: Path, entries: Sequence[Entry]) -> None:
 
 
 def _run(
-    folder: Path, entries: Sequence[Entry], engine: Engine, watcher: Watcher, *, resume: bool, force: bool
+    folder: Path,
+    entries: Sequence[Entry],
+    engine: Engine,
+    watcher: Watcher,
+    *,
+    resume: bool,
+    force: bool,
+    pictures: bool,
 ) -> Batch:
     with interruptions() as interrupted, engine:
         # To import this takes the better part of a second, in which the engine gets ready.
         from .ledger import Ledger, sort_out
+        from .sheet import present
 
         agenda = sort_out(folder, entries, resume=resume, force=force)
         ledger = Ledger(folder, entries, engine, agenda)
@@ -130,8 +140,11 @@ def _run(
                 ledger.add(result)
         finally:
             batch = Batch(folder, ledger.write())
-        if interrupted():
-            raise BatchInterruptedError(batch)
+        stopped = interrupted()
+    # Whoever stops a batch does not wait for pictures.
+    present(folder, batch.record, pictures=pictures and not stopped, progress=watcher.draw)
+    if stopped:
+        raise BatchInterruptedError(batch)
     return batch
 
 

@@ -14,6 +14,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
 from .jobs import Job, Result, Watcher
+from .specs import COMPARISON_NAME, PAGE_NAME, TABLE_NAME
 
 if TYPE_CHECKING:
     from .batch import Batch
@@ -68,6 +69,11 @@ class Lines(Watcher):
         self._done += 1
         self._failed += result.exit_code != 0
         self.tell(job, result)
+
+    def draw(self, done: int, total: int) -> None:
+        """Write once that pictures are drawn, which takes a while."""
+        if done == 1:
+            self.say(f"drawing {total} runs")
 
     def tell(self, job: Job, result: Result) -> None:
         """Write a line about a run that has ended."""
@@ -130,6 +136,14 @@ class Live(Lines):
             )
         self._show()
 
+    def draw(self, done: int, total: int) -> None:
+        """Show how many pictures are drawn."""
+        if done == 1:
+            for row in self._rows.values():
+                self._progress.remove_task(row)
+            self._rows.clear()
+        self._progress.update(self._whole, description="drawing", total=total, completed=done, text=f"{done}/{total}")
+
     def tell(self, job: Job, result: Result) -> None:
         """Write a line about a run that did not go well."""
         if result.exit_code != 0 or result.attempts > 1:
@@ -177,7 +191,8 @@ def summarize(batch: Batch) -> None:
         print(f"  {run['name']}: {run['reason']}{place}")
     if len(failed) > FAILURES_SHOWN:
         print(f"  and {len(failed) - FAILURES_SHOWN} more")
-    print(f"table: {batch.folder / 'batch.csv'}")
-    finished = next((run for run in record["runs"] if run["status"] == "finished"), None)
-    if finished is not None:
-        print(f"look:  warpjelly preview {batch.folder / finished['name']} -o {finished['name']}.png")
+    print(f"table: {batch.folder / TABLE_NAME}")
+    page, comparison = batch.folder / PAGE_NAME, batch.folder / COMPARISON_NAME
+    print(f"page:  {page} ({page.stat().st_size / 1e6:.1f} MB), for any browser")
+    if comparison.is_file():
+        print(f"stage: {comparison}, runs side by side")

@@ -56,6 +56,9 @@ class Watcher:
     def say(self, line: str) -> None:
         """Something that people should know."""
 
+    def draw(self, done: int, total: int) -> None:
+        """All jobs have ended, and pictures of so many of the runs are drawn."""
+
 
 class Engine(Protocol):
     """Does jobs somewhere; used in a ``with`` block, at whose start it gets ready."""

@@ -21,7 +21,8 @@ _SUFFIXES = (".toml", SUFFIX)
 _NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+=,-]*")
 # What a batch keeps beside its runs, and what some systems take for devices.
 RECORD_NAME, TABLE_NAME = "batch.json", "batch.csv"
-_RESERVED = {RECORD_NAME, TABLE_NAME, "index.html", "comparison.usda", "run.lock"}
+PAGE_NAME, COMPARISON_NAME = "index.html", "comparison.usda"
+_RESERVED = {RECORD_NAME, TABLE_NAME, PAGE_NAME, COMPARISON_NAME, "run.lock"}
 _DEVICES = {"con", "prn", "aux", "nul", *(f"{port}{number}" for port in ("com", "lpt") for number in range(1, 10))}
 
 

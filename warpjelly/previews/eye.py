@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from pxr import Gf, Usd, UsdGeom
 
+from ..stage.common import corners_of
 from ..stage.prims import matrix
 from ..stage.stagefiles import overridden
 from ..stage.surroundings import APERTURE, FOCAL_LENGTH, camera_axes, framing
@@ -32,7 +33,7 @@ class Eye:
     def _framing(self) -> Gf.Camera:
         """Return a camera like that of stages of our own."""
         axes = camera_axes(UsdGeom.GetStageUpAxis(self._stage))
-        position, distance, clipping = framing(axes, self._moved())
+        position, distance, clipping = framing(axes, corners_of(self._moved()))
         camera = Gf.Camera(matrix(axes, position))
         camera.horizontalAperture, camera.verticalAperture = APERTURE
         camera.focalLength, camera.focusDistance = FOCAL_LENGTH, distance

@@ -12,6 +12,8 @@ _FLOOR = (0.80, 0.81, 0.84)
 # The floor is drawn as far as this from where the camera looks, in distances of the camera.
 _REACH = 1.4
 _PIXELS = 1536
+# No pixel of a floor is smaller than so many of the picture's, where the camera looks.
+_FINENESS = 1.5
 _SHADOW_SOFTNESS = 0.012
 # How much the light's shadow takes away, and the dark line of contact.
 _SHADOW, _CONTACT = 0.28, 0.45
@@ -23,7 +25,7 @@ _COARSENESS = 3
 class Floor:
     """The part of a rectangle around what the camera looks at."""
 
-    def __init__(self, pyvista: Any, corners: np.ndarray, camera: Any, to_light: np.ndarray) -> None:
+    def __init__(self, pyvista: Any, corners: np.ndarray, camera: Any, to_light: np.ndarray, height: int) -> None:
         """Lay out a floor.
 
         Args:
@@ -31,6 +33,7 @@ class Floor:
             corners: of the rectangle, in turn around its front, float64 [4, 3], m.
             camera: pyvista's.
             to_light: unit vector [3].
+            height: of the picture, pixels.
         """
         sides = corners[[1, 3]] - corners[0]
         self._corner, self._to_light = corners[0], to_light
@@ -44,12 +47,13 @@ class Floor:
         self.seen = bool((np.array(camera.position) - corners[0]) @ self._normal > 0 and (start < end).all())
         if not self.seen:
             return
-        pixel = float(np.max(end - start)) / _PIXELS
+        shown = float(2 * camera.distance * np.tan(np.radians(camera.view_angle / 2)))
+        pixel = max(float(np.max(end - start)) / _PIXELS, _FINENESS * shown / height)
         self.shadow_pixel = _COARSENESS * pixel
-        width, height = np.maximum(np.ceil((end - start) / pixel), 2).astype(int).tolist()
+        columns, rows = np.maximum(np.ceil((end - start) / pixel), 2).astype(int).tolist()
         self._start = start
 
-        x, y = (start[i] + (np.arange(n) + 0.5) * pixel for i, n in enumerate((width, height)))
+        x, y = (start[i] + (np.arange(n) + 0.5) * pixel for i, n in enumerate((columns, rows)))
         step = _grid_step(camera.distance)
         lines = [np.clip(1.5 - np.abs(at - np.round(at / step) * step) / pixel, 0, 1) for at in (x, y)]
         fade = np.clip((np.hypot(x[None] - middle[0], y[:, None] - middle[1]) / reach - 0.35) / 0.6, 0, 1)
@@ -62,9 +66,9 @@ class Floor:
         self.rectangle = pyvista.PolyData(drawn, faces=[4, 0, 1, 2, 3])
         self.rectangle.active_texture_coordinates = at.astype(np.float32)
         self._bare = self._colored(np.s_[:, :], self._light)
-        self._image = pyvista.ImageData(dimensions=(width, height, 1))
+        self._image = pyvista.ImageData(dimensions=(columns, rows, 1))
         self._image.point_data["color"] = self._bare.reshape(-1, 3).copy()
-        self._shown = np.asarray(self._image.point_data["color"]).reshape(height, width, 3)
+        self._shown = np.asarray(self._image.point_data["color"]).reshape(rows, columns, 3)
         self._shaded = np.s_[0:0, 0:0]
         self.texture = pyvista.Texture(self._image)
         self.texture.mipmap = self.texture.interpolate = True

@@ -99,7 +99,7 @@ def _chosen_frames(
         if every != 1:
             raise InputError("a picture shows single frames: choose them with --frame; --every is for movies and pages")
         if frames is None:
-            return [_brightest_frame(stage, first, last)]
+            return [brightest_frame(stage, first, last)]
         if not frames:
             raise InputError("no frame to show")
         return list(frames)
@@ -112,7 +112,7 @@ def _chosen_frames(
     return list(range(first, last + 1, every))
 
 
-def _brightest_frame(stage: Usd.Stage, first: int, last: int) -> int:
+def brightest_frame(stage: Usd.Stage, first: int, last: int) -> int:
     """Return the frame with the brightest bodies, which have the greatest forces; without colours, the last."""
     brightness = np.zeros(last - first + 1)
     for mesh in shapes_in(stage, UsdGeom.PointBased):
@@ -128,7 +128,8 @@ def _write_picture(
     if len(frames) * size[0] * size[1] > MAX_PIXELS:
         raise InputError(f"{len(frames)} frames of {size[0]}x{size[1]}: more than {MAX_PIXELS:,} pixels")
     panels = []
-    with View(stage, size) as view:
+    with View(size) as view:
+        view.look_at(stage)
         for frame in frames:
             panels.append(view.render(frame))
             progress(len(panels), len(frames))
@@ -150,7 +151,8 @@ def _write_movie(
     if fps > MAX_FPS:
         least = math.ceil(stage.GetTimeCodesPerSecond() / MAX_FPS)
         raise InputError(f"{fps:g} frames a second are more than movies show: thin them with --every {least}")
-    with View(stage, size) as view, movie_writer(path, size, fps) as add:
+    with View(size) as view, movie_writer(path, size, fps) as add:
+        view.look_at(stage)
         for done, frame in enumerate(frames, start=1):
             picture = view.render(frame)
             add(captioned(stage, [frame], [picture], with_legend=view.shows_force))

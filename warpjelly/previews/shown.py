@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from pxr import Usd, UsdGeom
 
-from ..stage.prims import COLLIDERS
+from ..stage.prims import COLLIDERS, RUNS, WORLD
 
 # More paths than these are not listed.
 _LISTED = 3
@@ -28,7 +28,10 @@ def left_out(stage: Usd.Stage) -> str:
 
 def is_collider(shape: UsdGeom.Gprim) -> bool:
     """Say whether a shape stands for what the bodies of a run collide with."""
-    return bool(shape.GetPath().HasPrefix(COLLIDERS))
+    path = shape.GetPath()
+    if path.HasPrefix(RUNS):
+        path = path.ReplacePrefix(path.GetPrefixes()[RUNS.pathElementCount], WORLD)
+    return bool(path.HasPrefix(COLLIDERS))
 
 
 def is_floor(mesh: UsdGeom.Mesh) -> bool:

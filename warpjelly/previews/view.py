@@ -56,25 +56,17 @@ def require_pyvista() -> Any:
 class View:
     """Renders frames of a stage. What does not change from frame to frame is made once; use it in a ``with`` block."""
 
-    def __init__(self, stage: Usd.Stage, size: tuple[int, int]) -> None:
-        """Prepare to render a stage.
+    def __init__(self, size: tuple[int, int]) -> None:
+        """Open a window; ``look_at`` a stage then.
 
         Args:
-            stage: what to look at.
             size: width and height, pixels.
 
         Raises:
             InputError: pyvista is not installed.
             EnvironmentFailedError: there is no offscreen OpenGL.
         """
-        self._pyvista, self._stage, self._size = require_pyvista(), stage, size
-        self._eye = Eye(stage)
-        self._drawing = StageDrawing(self._pyvista, stage)
-        self._actors: list[Any] = []
-        self._floors: list[Floor] = []
-        # Where the floors are and what from they are seen.
-        self._floors_for = b""
-        self.shows_force = False
+        self._pyvista, self._size = require_pyvista(), size
         self._plotter = self._pyvista.Plotter(off_screen=True, window_size=size, lighting="none")
         self._plotter.set_background(BACKGROUND)
         self._lights = [self._pyvista.Light(light_type="scene light", intensity=strength) for _, strength in _LIGHTS]
@@ -82,6 +74,17 @@ class View:
             light.positional = False
             self._plotter.add_light(light)
         self._plotter.enable_anti_aliasing("ssaa")
+
+    def look_at(self, stage: Usd.Stage) -> None:
+        """Render this stage from now on."""
+        self._stage, self._eye = stage, Eye(stage)
+        self._drawing = StageDrawing(self._pyvista, stage)
+        self._plotter.clear_actors()
+        self._actors: list[Any] = []
+        self._floors: list[Floor] = []
+        # Where the floors are and what from they are seen.
+        self._floors_for = b""
+        self.shows_force = False
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -156,14 +159,18 @@ class View:
             self._floors_for = made_for
             for number in range(len(self._floors)):
                 self._plotter.remove_actor(f"floor {number}")
-            made = [Floor(self._pyvista, each, camera, to_light) for each in corners]
+            made = [Floor(self._pyvista, each, camera, to_light, self._size[1]) for each in corners]
             self._floors = [floor for floor in made if floor.seen]
             for number, floor in enumerate(self._floors):
                 self._plotter.add_mesh(
                     floor.rectangle, texture=floor.texture, lighting=False, name=f"floor {number}", reset_camera=False
                 )
-        for floor in self._floors:
-            floor.shade(np.concatenate([_sampled(solid.surface, floor.shadow_pixel) for solid in drawn.solids]))
+        # Floors of several runs side by side have pixels of one size.
+        for pixel in {floor.shadow_pixel for floor in self._floors}:
+            throwing = np.concatenate([_sampled(solid.surface, pixel) for solid in drawn.solids])
+            for floor in self._floors:
+                if floor.shadow_pixel == pixel:
+                    floor.shade(throwing)
 
 
 def _sampled(solid: pv.PolyData, spacing: float) -> np.ndarray:

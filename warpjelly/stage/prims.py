@@ -8,6 +8,8 @@ from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
 WORLD = Sdf.Path("/World")
 BODIES = WORLD.AppendChild("bodies")
 COLLIDERS = WORLD.AppendChild("colliders")
+# In a comparison, the worlds of the runs.
+RUNS = WORLD.AppendChild("runs")
 LOOKS = WORLD.AppendChild("looks")
 LIGHTS = WORLD.AppendChild("lights")
 CAMERA = WORLD.AppendChild("camera")
@@ -79,7 +81,7 @@ def bind_look(shape: UsdGeom.Gprim, look: str) -> None:
 
 
 def facing(direction: tuple[float, float, float], up_axis: str) -> np.ndarray:
-    """Return the axes (right, up, backward) [3, 3] of a camera or light that looks from a direction, said for Y up."""
+    """Return the axes (right, up, backward) [3, 3] of what looks from a direction, which is given for Y up."""
     x, y, z = direction
     backward = np.array([x, y, z] if up_axis == "Y" else [x, -z, y])
     backward /= np.linalg.norm(backward)

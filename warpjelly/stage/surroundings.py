@@ -92,9 +92,13 @@ def define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:
             if np.linalg.norm(center - np.clip(center, *bounds)) < collider.radius + diagonal / 2:
                 low = np.minimum(low, center - collider.radius)
                 high = np.maximum(high, center + collider.radius)
-    axes = camera_axes(scene.up_axis)
-    position, distance, clipping = framing(axes, np.array([low, high]))
-    camera = UsdGeom.Camera.Define(stage, CAMERA)
+    corners = np.array(list(np.ndindex(2, 2, 2))) * (high - low) + low
+    aim_camera(UsdGeom.Camera.Define(stage, CAMERA), camera_axes(scene.up_axis), corners)
+
+
+def aim_camera(camera: UsdGeom.Camera, axes: np.ndarray, points: np.ndarray) -> None:
+    """Place a camera with given axes [3, 3] as close as it sees all points [count, 3], m."""
+    position, distance, clipping = framing(axes, points)
     camera.CreateFocalLengthAttr(FOCAL_LENGTH)
     camera.CreateHorizontalApertureAttr(APERTURE[0])
     camera.CreateVerticalApertureAttr(APERTURE[1])
@@ -104,18 +108,18 @@ def define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:
 
 
 def camera_axes(up_axis: str) -> np.ndarray:
-    """Return the axes (right, up, backward) [3, 3] of the camera that ``framing`` places."""
+    """Return the axes (right, up, backward) [3, 3] of the camera of a run's stage."""
     return facing(_CAMERA_DIRECTION, up_axis)
 
 
-def framing(axes: np.ndarray, bounds: np.ndarray) -> tuple[np.ndarray, float, tuple[float, float]]:
-    """Return where a camera sees a whole box, how far away its middle is, and what to clip at.
+def framing(axes: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float, tuple[float, float]]:
+    """Return where a camera sees all points, how far away their middle is, and what to clip at.
 
     Args:
         axes: of the camera (right, up, backward), [3, 3].
-        bounds: of the box, [2, 3].
+        points: [count, 3], m.
     """
-    x, y, z = axes @ np.array(list(np.ndindex(2, 2, 2)) * (bounds[1] - bounds[0]) + bounds[0]).T
+    x, y, z = axes @ points.T
     # In the axes of the camera, a corner is seen from (X, Y, Z) while |x - X| <= s (Z - z), with s the slope of the
     # frustum's sides; the closest place that sees all follows from the outermost corner on each side.
     placed = []

@@ -79,7 +79,7 @@ def define_rest(
     """
     _define_world(stage, scene, provenance)
     _define_looks(stage)
-    _define_lights(stage, scene)
+    define_lights(stage, scene.up_axis)
     for shape, sample in zip(shapes, rest, strict=True):
         prim = _define_shape(stage, shape, sample, scene)
         if shape.model is not None:
@@ -239,7 +239,8 @@ def _define_looks(stage: Usd.Stage) -> None:
     collider.CreateInput("diffuseColor", color3f).Set(Gf.Vec3f(COLLIDER_GREY))
 
 
-def _define_lights(stage: Usd.Stage, scene: Scene) -> None:
+def define_lights(stage: Usd.Stage, up_axis: str) -> None:
+    """Light a stage from all around, and from the upper left and the right."""
     UsdGeom.Xform.Define(stage, LIGHTS)
     dome = UsdLux.DomeLight.Define(stage, LIGHTS.AppendChild("sky"))
     dome.CreateIntensityAttr(0.5)
@@ -252,7 +253,7 @@ def _define_lights(stage: Usd.Stage, scene: Scene) -> None:
         light.CreateAngleAttr(angle)
         # Normalised, the intensity means the same in renderers with and without soft shadows.
         light.CreateNormalizeAttr(True)
-        light.MakeMatrixXform().Set(matrix(facing(direction, scene.up_axis), np.zeros(3)))
+        light.MakeMatrixXform().Set(matrix(facing(direction, up_axis), np.zeros(3)))
 
 
 def _define_shape(stage: Usd.Stage, shape: Shape, rest: ShapeFrame, scene: Scene) -> UsdGeom.PointBased:

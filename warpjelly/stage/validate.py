@@ -9,6 +9,7 @@ import numpy as np
 from pxr import Sdf, Tf, Usd, UsdGeom, UsdShade, UsdUtils, UsdValidation
 
 from ..errors import reason
+from .comparison import RUN
 from .stagefiles import open_stage, overridden, silent_usd
 
 # The newest crate version that common viewers open.
@@ -174,7 +175,7 @@ def _shape(stage: Usd.Stage, prim: Usd.Prim) -> Iterator[tuple[float | None, str
 
 
 def _sampling(stage: Usd.Stage, prim: Usd.Prim, times: list[float]) -> Iterator[tuple[None, str]]:
-    start, end = stage.GetStartTimeCode(), stage.GetEndTimeCode()
+    start, end = _time_range(stage, prim)
     if times[0] > start or times[-1] < end:
         yield None, f"samples {times[0]:g} to {times[-1]:g} do not cover the time range {start:g} to {end:g}"
     steps = np.diff(times)
@@ -184,6 +185,15 @@ def _sampling(stage: Usd.Stage, prim: Usd.Prim, times: list[float]) -> Iterator[
         own = attribute.GetTimeSamples()
         if own and own != times:
             yield None, f"{attribute.GetName()} and points are sampled at different times"
+
+
+def _time_range(stage: Usd.Stage, prim: Usd.Prim) -> tuple[float, float]:
+    """Return the first and last time code at which a shape moves: those of its run, where a stage has several."""
+    while prim:
+        if run := prim.GetCustomDataByKey(RUN):
+            return run["startTimeCode"], run["endTimeCode"]
+        prim = prim.GetParent()
+    return stage.GetStartTimeCode(), stage.GetEndTimeCode()
 
 
 def _sample(gprim: UsdGeom.Gprim, code: Usd.TimeCode) -> Iterator[str]:
