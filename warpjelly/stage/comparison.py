@@ -157,7 +157,7 @@ def _columns(runs: Sequence[Compared]) -> int:
     last = next(reversed(list(runs[0].parameters)), None)
     values = len({json.dumps(run.parameters.get(last), default=str) for run in runs}) if last else 1
     fitting = [count for count in range(values, len(runs) + 1, values) if len(runs) % count == 0]
-    best = min(fitting, key=lambda count: abs(math.log(count / wanted)), default=1)
+    best = min(fitting, key=lambda count: abs(math.log(count / wanted)), default=0)
     return best if last and wanted / 2 <= best <= 2 * wanted else math.ceil(wanted)
 
 
