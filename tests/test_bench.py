@@ -113,9 +113,9 @@ def test_memory_counts_each_array_once():
     holder = SimpleNamespace(a=[array, {"b": own}], views=(array[10:20], array.numpy(), own[3:], own.reshape(2, 5)))
     assert bench.held_bytes(holder) == 400 + 80
     model = Simulator(bench.Cubes(3).scene(colliders=bench.COLLIDERS), device="cpu").model
-    kinds, charges = model.colliders.kind, model.particle_charge
+    kinds, masses = model.colliders.kind, model.particle_mass
     assert bench.held_bytes([model.colliders, kinds]) == bench.held_bytes(model.colliders) > kinds.capacity
-    assert bench.held_bytes(charges) == 27 * 4
+    assert bench.held_bytes(masses) == 27 * 4
 
 
 @pytest.mark.parametrize(("now", "slower"), [(7.4, True), (7.6, False), (10.0, False), (30.0, False)])

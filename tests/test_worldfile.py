@@ -461,6 +461,6 @@ def test_a_world_that_cannot_be_written_leaves_nothing(tmp_path: Path) -> None:
     with pytest.raises(EnvironmentFailedError, match=r"none/b\.w: cannot write the world: No such file or directory"):
         write_world(scene, tmp_path / "none" / "b.w")
     (tmp_path / "b.w").mkdir()
-    with pytest.raises(EnvironmentFailedError, match=r"b\.w: cannot write the world: Is a directory"):
+    with pytest.raises(InputError, match=r"b\.w: it is a folder; choose the name of a file"):
         write_world(scene, tmp_path / "b.w", force=True)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.w", "b.w"]
