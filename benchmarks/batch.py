@@ -4,7 +4,7 @@ python benchmarks/batch.py [RUNS]
 
 The same runs are done by `warpjelly batch` with one worker and with two, and by a `warpjelly run` for each, one after
 another, of which some are enough; all are whole processes, from the start of Python to the last file. Kernels are
-compiled before.
+compiled before. Pictures for the page of the batch are left out, as a single run has none.
 """
 
 import subprocess
@@ -36,7 +36,7 @@ def main() -> None:
         vary = f'[vary]\n"bodies.cube.position.1" = {{ range = [1.0, 2.0], count = {runs} }}\n'
         sweep.write_text(f"base = '{SCENE}'\n{vary}")
         measure("run", SCENE, f"--frames={FRAMES}", f"--output={folder / 'first'}")
-        batch = ["batch", sweep, f"--frames={FRAMES}", f"--output={folder / 'batch'}", "--force"]
+        batch = ["batch", sweep, f"--frames={FRAMES}", f"--output={folder / 'batch'}", "--force", "--no-pictures"]
         # The separate runs before and after, as the speed of machines drifts.
         single = ["run", SCENE, f"--frames={FRAMES}", f"--output={folder / 'single'}", "--force"]
         alone = sum(measure(*single) for _ in range(SEPARATE // 2))
