@@ -157,7 +157,7 @@ def test_names_are_made_from_values(tmp_path):
         ('name = "{x:d}"\n[vary]\nx = [0.5]', "{x:d} cannot write 0.5"),
         ('name = "a"\n[vary]\nx = [1, 2]', "2 runs are called 'a'"),
         ('name = "../{x}"\n[vary]\nx = [1]', "cannot be called '../1': its folder would not be in that of the batch"),
-        ('name = "/tmp/{x}"\n[vary]\nx = [1]', "cannot be called '/tmp/1'"),
+        ('name = "/elsewhere/{x}"\n[vary]\nx = [1]', "cannot be called '/elsewhere/1'"),
         ('name = "a\\\\{x}"\n[vary]\nx = [1]', "its folder would not be in that of the batch"),
         ('name = "..{x}"\n[vary]\nx = [""]', "cannot be called '..'"),
         ('name = ".{x}"\n[vary]\nx = [1]', "names are of letters"),

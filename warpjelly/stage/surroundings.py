@@ -6,6 +6,7 @@ import numpy as np
 from pxr import Gf, Sdf, Usd, UsdGeom
 
 from ..scene import BoxCollider, HalfSpaceCollider, PlaneCollider, Scene, SphereCollider, plane_frame
+from .common import corners_of
 from .prims import (
     CAMERA,
     COLLIDER_GREY,
@@ -92,7 +93,7 @@ def define_camera(stage: Usd.Stage, scene: Scene, bounds: np.ndarray) -> None:
             if np.linalg.norm(center - np.clip(center, *bounds)) < collider.radius + diagonal / 2:
                 low = np.minimum(low, center - collider.radius)
                 high = np.maximum(high, center + collider.radius)
-    corners = np.array(list(np.ndindex(2, 2, 2))) * (high - low) + low
+    corners = corners_of(np.stack([low, high]))
     aim_camera(UsdGeom.Camera.Define(stage, CAMERA), camera_axes(scene.up_axis), corners)
 
 
