@@ -150,14 +150,18 @@ def clip_length(point_count: int) -> int:
     return max(1, min(CLIP_FRAMES, CLIP_BYTES // (BYTES_PER_SAMPLE * max(point_count, 1))))
 
 
-def plan_scene(scene: Scene) -> Plan:
+def plan_scene(scene: Scene, known: Plan | None = None) -> Plan:
     """Find out how every body is made and count what follows from it.
+
+    Args:
+        scene: what to plan.
+        known: a plan whose bodies are taken over where they are made alike; their models are not read again.
 
     Raises:
         SceneError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
     shot = _open_shot(scene)
-    plan = Plan(scene, [_plan_body(body, scene, shot) for body in scene.bodies])
+    plan = Plan(scene, [_known_body(body, scene, known) or _plan_body(body, scene, shot) for body in scene.bodies])
     if shot is not None:
         _require_meshes(shot, plan)
     most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]
@@ -169,6 +173,39 @@ def plan_scene(scene: Scene) -> Plan:
         what += f", '{name}' {share / 1e9:.1f} GB of it,"
     _require_memory(plan.memory_bytes, what)
     return plan
+
+
+# What a body is made of does not depend on these.
+_PLACING = {"name", "position", "rotation", "velocity", "angular_velocity", "charge", "pinned"}
+_PLACING |= {"positions", "velocities"}
+
+
+def _material_names(body: AnyBody) -> list[str]:
+    """Return the material of a body, and that of each of its regions."""
+    regions = body.regions if isinstance(body, VoxelsBody | ModelBody) else []
+    return [body.material, *(region.material for region in regions)]
+
+
+def _known_body(body: AnyBody, scene: Scene, known: Plan | None) -> BodyPlan | None:
+    """Return the plan of a body from that of another scene, if one there is made alike."""
+    if known is None or scene.output.over is not None or known.scene.output.over is not None:
+        return None
+
+    def making(body: AnyBody, scene: Scene) -> tuple[Any, ...]:
+        names = _material_names(body)
+        # Which of them are the same says which cells are alike, and the law what has to be known of cells.
+        alike = [(names.index(name), scene.materials[name].law) for name in names]
+        regions = body.regions if isinstance(body, VoxelsBody | ModelBody) else []
+        made = body.model_dump(exclude={*_PLACING, "material", "regions"})
+        selected = [region.model_dump(exclude={"material"}) for region in regions]
+        return made, selected, alike, scene.up_axis, scene.output.surface, set(scene.output.show)
+
+    wanted = making(body, scene)
+    for plan in known.bodies:
+        if making(plan.body, known.scene) == wanted:
+            renamed = dict(zip(_material_names(plan.body), _material_names(body), strict=True))
+            return replace(plan, body=body, materials={renamed[name]: count for name, count in plan.materials.items()})
+    return None
 
 
 def _open_shot(scene: Scene) -> Shot | None:

@@ -34,6 +34,9 @@ from .stepping import MAX_CAPTURED_SUBSTEPS, Stepper, capture_lock
 
 steps = logging.getLogger("warpjelly.steps")
 
+# Substeps beyond whole frames are replayed so many at a time: few enough to capture at once, when they are asked for.
+REST_BLOCK = 8
+
 
 class Simulator:
     """A scene in motion.
@@ -139,7 +142,8 @@ class Simulator:
         if count < 0:
             raise ValueError(f"cannot step back by {-count} substeps")
         frames, rest = divmod(count, self.substeps)
-        for substeps in self._frame_blocks() * frames + [1] * rest:
+        blocks, single = divmod(rest, REST_BLOCK)
+        for substeps in self._frame_blocks() * frames + [REST_BLOCK] * blocks + [1] * single:
             self._stepper.step(substeps)
         self.substep_count += count
 
@@ -150,6 +154,14 @@ class Simulator:
             DivergedError: a position or velocity is not finite any more, or absurd.
         """
         self.step(self.substeps)
+        self.require_sane()
+
+    def require_sane(self) -> None:
+        """Make sure that every particle is at a sane place and speed.
+
+        Raises:
+            DivergedError: a position or velocity is not finite any more, or absurd.
+        """
         if (particle := self.first_lost()) is not None:
             body = next(body for body in self.model.bodies if particle < body.particles.stop)
             # The limits belong to rest, which is lost: they are named if they were asked for before.
@@ -160,6 +172,10 @@ class Simulator:
                 f"{f'{broken}; ' if broken else ''}lower solver.dt (now {self.dt:.3g} s), or stiffness and damping of "
                 "its material or of a collider"
             )
+
+    def update_forces(self) -> None:
+        """Evaluate the forces of the current state anew, after it was changed by hand; nothing else changes."""
+        self._stepper.add_forces(loss_weight=0.0)
 
     def first_lost(self) -> int | None:
         """Return the smallest index of a particle that is not at a sane place and speed, None if all are."""
