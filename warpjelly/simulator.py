@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from warpjelly.kernels import diagnostics, shapes
 
 from .device import choose_device
 from .errors import DivergedError, SceneError
+from .grip import Grip
 from .machine import available_cores
 from .model import Model, State, build
 from .plan import Plan, plan_scene
@@ -45,13 +47,16 @@ class Simulator:
         scene: what to simulate, or its plan.
         device: "auto", "cpu", "cuda:0" ...
         threads: how many may be used on the CPU, None for one per core; results do not depend on it.
+        interactive: whether there is a ``grip``, a hand to pull with.
 
     Raises:
         InputError: the scene cannot be built (SceneError), or there is no such device.
         ValueError: threads is less than 1.
     """
 
-    def __init__(self, scene: Scene | Plan, *, device: str = "auto", threads: int | None = None) -> None:
+    def __init__(
+        self, scene: Scene | Plan, *, device: str = "auto", threads: int | None = None, interactive: bool = False
+    ) -> None:
         if threads is not None and threads < 1:
             raise ValueError(f"cannot simulate with {threads} threads")
         plan = scene if isinstance(scene, Plan) else plan_scene(scene)
@@ -61,6 +66,8 @@ class Simulator:
         self.state: State
         with capture_lock:
             self.model, self.state = build(plan, device=self.device)
+            # Where the limits may be asked for later.
+            self._rest = wp.clone(self.state.x) if interactive else None
         self.substep_count = 0
         """Substeps since the start."""
         self._limits: tuple[dict[str, float | None], dict[str, float | None]] | None = None
@@ -78,6 +85,8 @@ class Simulator:
             self._normals = wp.zeros(int(self._normal_start[-1]), dtype=wp.vec3f)
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
+        self.grip = Grip(self.model, self.state, dt=self.dt) if interactive else None
+        """A hand to pull particles with."""
         with capture_lock:
             self._stepper = Stepper(
                 self.model,
@@ -86,6 +95,7 @@ class Simulator:
                 dt=self.dt,
                 culling=self.scene.solver.culling,
                 threads=available_cores() if threads is None else threads,
+                grip=self.grip,
             )
 
     @property
@@ -184,19 +194,21 @@ class Simulator:
         first = int(self._lost.numpy()[0])
         return first if first < self.model.particle_count else None
 
-    def step_limits(self, *, contacts: bool) -> dict[str, float | None]:
+    def step_limits(self, *, contacts: bool, wanted: Callable[[], None] = lambda: None) -> dict[str, float | None]:
         """Return the largest stable step of each integrator, s; None where it has none.
 
-        Belongs to small motions about time zero, so it is to be asked for the first time before the first step.
+        Belongs to small motions about time zero, so it is to be asked for the first time before the first step, unless
+        the simulator is interactive: then at any time, also in another thread than that which steps.
 
         Args:
             contacts: as if each particle touched the worst collider, which is a safe bound; else the springs alone.
+            wanted: called now and then; raises something where the limits are not wanted any more.
         """
         if self._limits is None:
-            if self.substep_count > 0:
+            if self.substep_count > 0 and self._rest is None:
                 raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
             steps.info("finding the largest stable step")
-            pairs = bound_spring_pairs(self.model, self.state.x)
+            pairs = bound_spring_pairs(self.model, self.state.x if self._rest is None else self._rest, wanted)
             self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self._contact_pairs))
         return self._limits[contacts]
 

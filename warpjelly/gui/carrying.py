@@ -51,6 +51,17 @@ def carry_over(old: Simulator, new: Simulator) -> None:
     new.update_forces()
 
 
+def carry_hold(old: Simulator, new: Simulator) -> None:
+    """Let the hand of a new simulation hold what that of another one holds, if it is there."""
+    assert old.grip is not None and new.grip is not None
+    if (hold := old.grip.hold) is None:
+        return
+    before, now = (next((body for body in sim.model.bodies if body.name == hold.body), None) for sim in (old, new))
+    if before is not None and now is not None and _size(before) == _size(now):
+        new.grip.go_on(hold)
+        new.update_forces()
+
+
 def move_body(sim: Simulator, name: str, displacement: np.ndarray, *, at_rest: bool) -> None:
     """Put a body elsewhere as it is, as if it started there: it is in contact where a body that starts is.
 

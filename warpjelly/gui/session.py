@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import atexit
 import logging
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -15,12 +17,17 @@ import numpy as np
 
 from ..device import choose_device
 from ..errors import DivergedError, InputError, WarpjellyError, verdict
+from ..grip import Grip
 from ..model import Body
 from ..scene import Scene
 from ..scenefile import load_scene
-from ..shapes import Shape, ShapeFrame
+from ..scenewriter import require_scene_file, write_scene
 from ..simulator import REST_BLOCK, Simulator
-from .carrying import carry_over, center_of_mass, move_body
+from ..stability import evaluations
+from ..starts import warn_of_deep_starts
+from ..stepping import capture_lock
+from .carrying import carry_hold, carry_over, center_of_mass, move_body
+from .recording import Place, Recording, shown_by
 from .setup import (
     DEFAULT_COLLIDERS,
     DEFAULT_TABLES,
@@ -33,6 +40,8 @@ from .setup import (
     entry_named,
     move_start,
 )
+from .snapshot import Energies, Limits, Message, Pull, Recorded, Snapshot
+from .uploads import Uploads
 
 log = logging.getLogger("warpjelly")
 
@@ -48,75 +57,16 @@ SNAPSHOT_SHARE, ENERGY_SHARE = 0.25, 0.05
 MOST_BEHIND = 0.1
 # Speeds are means over so long, s.
 RATE_WINDOW = 1.0
+# Larger set-ups get no limits: so many springs, times evaluations of their forces, take some ten seconds.
+MOST_EVALUATIONS = 1e9
+# Kinds of commands of which only the last is carried out where several follow each other.
+EDIT, MOVE_HAND = "edit", "move hand"
 # Points of the energy plot, and messages, that are kept.
 HISTORY, MESSAGES = 2000, 100
 
 
-@dataclass(frozen=True)
-class Energies:
-    """What there is of energy at a time, J."""
-
-    time: float
-    """Simulated time, s."""
-    kinetic: float
-    elastic: float
-    potential: float
-    """Of gravity, zero at the origin."""
-    contact: float
-    """Stored in penetrated colliders and overlapping particles."""
-
-    @property
-    def total(self) -> float:
-        """All of it, J."""
-        return self.kinetic + self.elastic + self.potential + self.contact
-
-
-@dataclass(frozen=True)
-class Message:
-    """Something that people should know."""
-
-    number: int
-    """Ascending from 1."""
-    level: str
-    """info, warning or error."""
-    text: str
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """What a session shows at a moment; immutable, and so are its arrays."""
-
-    number: int
-    """Ascending from 1 with each snapshot."""
-    revision: int
-    """Ascending with each set-up: where it is the same, so are scene, shapes (topology) and bodies."""
-    scene: Scene
-    """The set-up that is simulated."""
-    bodies: tuple[Body, ...]
-    """Names of the bodies, and their particles."""
-    shapes: tuple[Shape, ...]
-    """What is shown, prim by prim; what stays the same."""
-    frames: tuple[ShapeFrame, ...]
-    """A sample of each shape."""
-    centers: Mapping[str, np.ndarray]
-    """Centre of mass of each body, float64 [3], m."""
-    time: float
-    """Simulated time, s."""
-    dt: float
-    """The time step used, s."""
-    playing: bool
-    diverged: bool
-    """Whether the simulation left the world; then this is the last good moment, until a reset or an edit."""
-    energies: Energies
-    """As last measured, which may be some moments earlier."""
-    substeps_per_second: float
-    """While it plays; else 0."""
-    real_time: float
-    """Simulated over real time, as reached; 0 unless it plays."""
-    particles: int
-    springs: int
-    messages: tuple[Message, ...]
-    """The last ones, oldest first."""
+class _UnwantedError(Exception):
+    """The set-up whose limits were looked for is not there any more."""
 
 
 @dataclass
@@ -124,8 +74,10 @@ class _Command:
     """Something to do in the thread of the session."""
 
     run: Callable[[], None]
-    setup: SetUp | None = None
-    """Of an edit: what it makes of the set-up. Of two that follow each other, the first is left out."""
+    kind: str = ""
+    """Of two that follow each other and are of the same kind, unless it is empty, the first is left out."""
+    edits: bool = False
+    """Whether it changes the set-up."""
 
 
 class Session:
@@ -161,9 +113,12 @@ class Session:
         self._snapshot: Snapshot | None = None
         # Of the thread alone.
         self._setup = SetUp.of(DEFAULT_TABLES, Path.cwd()) if scene is None else SetUp.from_scene(scene)
+        # Guarded by _editing for whoever edits, and by _changed.
         self._wanted = self._setup
-        self._sim = Simulator(self._setup.plan, device=self._device)
+        self._sim = Simulator(self._setup.plan, device=self._device, interactive=True)
         self._stale = False
+        self._recording: Recording | None = None
+        self._uploads = Uploads()
         self._revision = 1
         self._playing = self._diverged = False
         self._dirty = True
@@ -171,10 +126,17 @@ class Session:
         self._substep_seconds = 0.0
         self._rates: deque[tuple[float, float, int]] = deque()
         self._next_snapshot = self._next_energies = 0.0
+        self._limits: Limits | None = None
+        self._seeker: threading.Thread | None = None
+        self._told: set[str] = set()
         self._energies = self._measure()
+        self._warn_of_start()
         self._publish()
+        self._seek_limits()
         self._thread = threading.Thread(target=self._run, name="warpjelly session", daemon=True)
         self._thread.start()
+        # A thread that were stepping while Python ends would crash.
+        atexit.register(self.close)
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -294,7 +256,7 @@ class Session:
             self._require_sound()
             self._start()
             self._playing, self._dirty = False, True
-            self._sim.step(substeps)
+            self._go_on(substeps)
             self._look_after()
 
         self._submit(_Command(step))
@@ -303,16 +265,24 @@ class Session:
         """Go back to time zero of the set-up; it goes on playing if it does, unless it has diverged."""
 
         def reset() -> None:
+            if self._recording is not None:
+                raise InputError(f"recording to {self._recording.place.folder}; stop the recording first")
             self._rebuild(carry=False)
 
         self._submit(_Command(reset))
 
     def close(self) -> None:
-        """End the simulation and its thread."""
+        """End the simulation and its thread; a recording is finished, files that were sent are removed."""
+        atexit.unregister(self.close)
+        with suppress(InputError):
+            self.stop_recording()
         with self._changed:
             self._closing = True
             self._changed.notify_all()
         self._thread.join()
+        if self._seeker is not None:
+            self._seeker.join()
+        self._uploads.close()
 
     # The set-up.
 
@@ -403,7 +373,9 @@ class Session:
     def take(self, scene: Scene) -> None:
         """Take a scene as the set-up, held at time zero."""
         with self._editing:
-            setup = SetUp.from_scene(scene)
+            with self._heard():
+                setup = SetUp.from_scene(scene)
+            self._require_recordable(setup.scene)
 
             def begin() -> None:
                 self._playing = False
@@ -437,10 +409,9 @@ class Session:
         with self._editing:
             entry_named(self._wanted.tables, "bodies", body)
             if to is not None:
-                by = np.array(to, float) - self._ask(lambda: center_of_mass(self._sim, self._body(body)))
-            displacement = np.array(by, float)
-            if displacement.shape != (3,) or not np.isfinite(displacement).all():
-                raise InputError(f"teleport: {by}: must be three numbers")
+                place = _vector("teleport", to)
+                by = (place - self._ask(lambda: center_of_mass(self._sim, self._body(body)))).tolist()
+            displacement = _vector("teleport", () if by is None else by)
             setup = self._wanted.edited(lambda tables: move_start(tables, body, displacement))
 
             def move() -> None:
@@ -453,25 +424,175 @@ class Session:
 
             self._submit(_Command(move), setup)
 
+    def grab(self, body: str, point: Sequence[float]) -> None:
+        """Take hold of the particles of a body that are nearest to a point, and of nothing else.
+
+        Args:
+            body: its name.
+            point: [3], m.
+
+        Raises:
+            InputError: there is no such body, or all of it is pinned.
+        """
+        place = _vector("grab", point)
+        entry_named(self._wanted.tables, "bodies", body)
+
+        def grab() -> None:
+            self._grip.grab(body, place)
+            self._dirty = True
+
+        self._ask(grab)
+
+    def drag(self, point: Sequence[float]) -> None:
+        """Move the hand to a point [3], m: what it holds is pulled there by a damped spring, if it holds anything."""
+        hand = _vector("drag", point)
+
+        def move() -> None:
+            if self._grip.hold is not None:
+                self._grip.move(hand)
+                self._dirty = True
+
+        self._submit(_Command(move, MOVE_HAND))
+
+    def release(self) -> None:
+        """Let go of what is held."""
+
+        def release() -> None:
+            self._grip.release()
+            self._dirty = True
+
+        self._submit(_Command(release))
+
+    # What lasts.
+
+    def upload(self, name: str, content: bytes) -> Path:
+        """Keep a model file that a viewer sends, and return where it is, for ``add_body``; ``save`` copies it.
+
+        Args:
+            name: of the file, which tells its format.
+            content: of the file.
+
+        Raises:
+            InputError: it is not the kind of file that models are in, empty, or too large.
+        """
+        return self._uploads.add(name, content)
+
+    def save(self, path: str | Path, *, force: bool = False) -> None:
+        """Write the set-up as a scene file, from which ``warpjelly run`` makes what a reset and playing make here.
+
+        Model files are named relative to it; those that were sent are copied into a folder beside it.
+
+        Args:
+            path: file to write, .toml.
+            force: replace a file that is there already.
+
+        Raises:
+            InputError: the name has another ending, or the file exists.
+            EnvironmentFailedError: it cannot be written.
+        """
+        path = Path(path)
+        with self._editing:
+            require_scene_file(path, force=force)
+            write_scene(self._wanted.with_files(lambda file: self._kept(file, path)).scene, path, force=force)
+        self.tell(f"saved as {path}")
+
+    def _kept(self, file: Path, scene: Path) -> Path:
+        """Return where a file is after a scene was saved."""
+        return self._uploads.copy(file, scene.parent / f"{scene.stem}_models") if self._uploads.has(file) else file
+
+    def record(self, directory: str | Path, *, force: bool = False) -> None:
+        """Record from now on, in the frames of the scene, into a run directory; the present is sample 0.
+
+        Until the end of the recording only what the stage shows as motion may change: edits of bodies' shapes, of
+        colliders' places, of the solver and of what is shown are refused, and so is a reset.
+
+        Args:
+            directory: the run directory.
+            force: replace a run that is there already.
+
+        Raises:
+            InputError: it is a file, holds a run, or another process is writing to it; or a recording is going.
+            EnvironmentFailedError: it cannot be written to.
+        """
+        with self._editing:
+            if self._recording is not None:
+                raise InputError(f"recording to {self._recording.place.folder} already; stop that first")
+            place = Place(Path(directory), force=force)
+
+            def begin() -> None:
+                self._require_sound()
+                self._start()
+                self._recording = Recording(place, self._sim, self._setup.scene)
+                self._dirty = True
+
+            try:
+                self._ask(begin)
+            except BaseException:
+                place.close()
+                raise
+
+    def stop_recording(self) -> dict[str, Any]:
+        """End the recording, and wait until its stage is whole; the simulation goes on meanwhile.
+
+        Returns:
+            The contents of run.json.
+
+        Raises:
+            InputError: no recording is going.
+            EnvironmentFailedError: not all could be written; what could is in the run directory.
+        """
+        with self._editing:
+            recording = self._recording
+            if recording is None:
+                raise InputError("no recording is going")
+            self._ask(self._end_recording)
+        record = recording.wait()
+        self.tell(f"recorded {recording.frames} frames into {recording.place.folder}")
+        return record
+
     # Commands.
 
     def _edit(self, edit: Callable[[Tables], Result]) -> Result:
         """Check an edit of the tables, have it carried out, and return what the edit does."""
         with self._editing:
             results: list[Result] = []
-            setup = self._wanted.edited(lambda tables: results.append(edit(tables)))
-            self._submit(_Command(lambda: self._apply(setup, carry=True), setup), setup)
+            with self._heard():
+                setup = self._wanted.edited(lambda tables: results.append(edit(tables)))
+            self._require_recordable(setup.scene)
+            self._submit(_Command(lambda: self._apply(setup, carry=True), EDIT), setup)
             return results[0]
+
+    def _require_recordable(self, scene: Scene) -> None:
+        """Refuse an edit that a recording could not show."""
+        if self._recording is not None and shown_by(scene) != self._recording.shown:
+            folder = self._recording.place.folder
+            raise InputError(f"recording to {folder}, whose stage cannot show this change; stop the recording first")
+
+    @contextmanager
+    def _heard(self) -> Iterator[None]:
+        """Tell viewers of what is warned of in this thread."""
+        thread, heard = threading.get_ident(), logging.Handler(logging.WARNING)
+        texts: list[str] = []
+        heard.emit = lambda record: texts.append(record.getMessage()) if record.thread == thread else None  # type: ignore[method-assign]
+        log.addHandler(heard)
+        try:
+            yield
+        finally:
+            log.removeHandler(heard)
+        for text in texts:
+            if text not in self._told:
+                self.tell(text, "warning")
+        self._told = set(texts)
 
     def _submit(self, command: _Command, wanted: SetUp | None = None) -> None:
         with self._changed:
             if self._closing:
                 raise InputError("the session is closed")
-            if command.setup is not None and self._commands and self._commands[-1].setup is not None:
+            if command.kind and self._commands and self._commands[-1].kind == command.kind:
                 self._commands.pop()
             self._commands.append(command)
             if wanted is not None:
-                self._wanted = wanted
+                command.edits, self._wanted = True, wanted
             self._changed.notify_all()
 
     def _ask(self, question: Callable[[], Result]) -> Result:
@@ -530,7 +651,7 @@ class Session:
         text, _ = verdict(error)
         with self._changed:
             self._failure = self._failure or (error if isinstance(error, WarpjellyError) else WarpjellyError(text))
-            if not any(command.setup is not None for command in self._commands):
+            if not any(command.edits for command in self._commands):
                 self._wanted = self._setup
         self._playing = False
         self.tell(text, "error")
@@ -542,11 +663,37 @@ class Session:
         if self._sim.time > self._due(began):
             return
         count = 1 if self._substep_seconds > LONG_SUBSTEP else REST_BLOCK
-        self._sim.step(count)
+        self._go_on(count)
         ended = time.perf_counter()
         self._substep_seconds = (ended - began) / count
         if self._due(ended) - self._sim.time > MOST_BEHIND * self._speed:
             self._set_anchor()
+
+    def _go_on(self, substeps: int) -> None:
+        """Take some substeps, and the samples of a recording among them."""
+        while substeps > 0:
+            count = substeps if self._recording is None else min(substeps, self._recording.missing)
+            self._sim.step(count)
+            substeps -= count
+            if self._recording is not None:
+                try:
+                    self._recording.advanced(self._sim, count)
+                except WarpjellyError:
+                    self._abandon_recording()
+                    raise
+
+    def _end_recording(self) -> None:
+        """Take no more samples."""
+        recording, self._recording, self._dirty = self._recording, None, True
+        if recording is not None:
+            recording.finish(self._sim, diverged=self._diverged)
+
+    def _abandon_recording(self) -> None:
+        """Give up what could not be written; what was written stays."""
+        recording, self._recording = self._recording, None
+        if recording is not None:
+            with suppress(WarpjellyError):
+                recording.wait()
 
     def _due(self, now: float) -> float:
         """Return the simulated time that belongs to a moment while playing, s."""
@@ -579,6 +726,10 @@ class Session:
         except DivergedError as error:
             self._playing, self._diverged, self._dirty = False, True, True
             self.tell(f"{error}; this is the last good moment", "error")
+            if (recording := self._recording) is not None:
+                self._end_recording()
+                recording.wait()
+                self.tell(f"recorded {recording.frames} frames into {recording.place.folder}")
 
     def _apply(self, setup: SetUp, *, carry: bool) -> None:
         """Simulate another set-up."""
@@ -590,11 +741,13 @@ class Session:
             raise
 
     def _rebuild(self, *, carry: bool) -> None:
-        sim = Simulator(self._setup.plan, device=self._device)
+        sim = Simulator(self._setup.plan, device=self._device, interactive=True)
         if self._diverged:
             self._playing = False
         elif carry and self._sim.substep_count > 0:
             carry_over(self._sim, sim)
+        if carry and not self._diverged:
+            carry_hold(self._sim, sim)
         if sim.substep_count == 0:
             with self._changed:
                 self._history.clear()
@@ -602,6 +755,47 @@ class Session:
         self._revision += 1
         self._substep_seconds = 0.0
         self._set_anchor()
+        self._warn_of_start()
+        self._seek_limits()
+
+    def _warn_of_start(self) -> None:
+        """Tell of bodies that start in colliders or in each other."""
+        if self._sim.substep_count == 0:
+            with self._heard():
+                warn_of_deep_starts(self._sim)
+
+    def _seek_limits(self) -> None:
+        """Find the largest stable step of the set-up, in a thread of its own."""
+        sim = self._sim
+        self._limits = None
+
+        def require_wanted() -> None:
+            if self._sim is not sim or self._closing:
+                raise _UnwantedError
+
+        def seek() -> None:
+            if evaluations(sim.model) * sim.model.spring_count > MOST_EVALUATIONS:
+                return
+            name = sim.scene.solver.integrator
+            try:
+                springs, contact = (sim.step_limits(contacts=on, wanted=require_wanted)[name] for on in (False, True))
+            except _UnwantedError:
+                return
+            with capture_lock:
+                limits = Limits(springs, contact, sim.broken_limit())
+            with self._changed:
+                if self._sim is sim:
+                    self._limits = limits
+                    assert self._snapshot is not None
+                    self._show(replace(self._snapshot, limits=limits))
+
+        self._seeker = threading.Thread(target=seek, name="warpjelly limits", daemon=True)
+        self._seeker.start()
+
+    @property
+    def _grip(self) -> Grip:
+        assert self._sim.grip is not None
+        return self._sim.grip
 
     def _body(self, name: str) -> Body:
         return next(body for body in self._sim.model.bodies if body.name == name)
@@ -612,6 +806,12 @@ class Session:
         figures = self._sim.diagnostics()
         names = ("kinetic", "elastic", "potential", "contact")
         return Energies(self._sim.time, **{name: figures[name] for name in names})
+
+    def _pull(self) -> Pull | None:
+        grip = self._grip
+        if (hold := grip.hold) is None:
+            return None
+        return Pull(hold.body, grip.point(), hold.hand, grip.force())
 
     def _publish(self) -> None:
         """Make a snapshot of the present, or of the last good moment."""
@@ -647,13 +847,19 @@ class Session:
                 real_time=rates[1],
                 particles=sim.model.particle_count,
                 springs=sim.model.spring_count,
+                limits=None,
+                pull=self._pull(),
+                recording=None,
                 messages=(),
             )
         ended = time.perf_counter()
         self._next_snapshot = max(began + 1.0 / SNAPSHOT_RATE, ended + (ended - began) / SNAPSHOT_SHARE)
         self._dirty = False
+        recording = None
+        if self._recording is not None:
+            recording = Recorded(self._recording.place.folder, self._recording.frames)
         with self._changed:
-            self._show(replace(snapshot, messages=tuple(self._messages)))
+            self._show(replace(snapshot, limits=self._limits, recording=recording, messages=tuple(self._messages)))
 
     def _update_rates(self, now: float) -> tuple[float, float]:
         """Return substeps per second and simulated over real time, means over the last moments of playing."""
@@ -679,3 +885,18 @@ class Session:
 
     def _is_newer(self, number: int) -> bool:
         return self._snapshot is not None and self._snapshot.number > number
+
+
+def _vector(what: str, given: Sequence[float]) -> np.ndarray:
+    """Return three finite numbers as an array.
+
+    Raises:
+        InputError: they are not.
+    """
+    try:
+        vector = np.array(given, float)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise InputError(f"{what}: {given!r} must be three numbers")
+    return vector

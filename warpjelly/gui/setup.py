@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import itertools
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from ..errors import InputError
 from ..plan import Plan, plan_scene
 from ..scene import Scene
 from ..scenefile import entry_of, set_key, validate_scene
+from ..scenewriter import FILE_KEYS
 from ..stepping import capture_lock
 
 Tables = dict[str, Any]
@@ -103,6 +104,26 @@ class SetUp:
         tables = copy.deepcopy(self.tables)
         edit(tables)
         return SetUp.of(tables, self.folder, self.plan)
+
+    def with_files(self, place: Callable[[Path], Path]) -> SetUp:
+        """Return the set-up with its files elsewhere.
+
+        Args:
+            place: says for each file where it is.
+        """
+
+        def moved(node: Any) -> Any:
+            if isinstance(node, list):
+                return [moved(entry) for entry in node]
+            if not isinstance(node, dict):
+                return node
+            return {
+                key: str(place(Path(value))) if key in FILE_KEYS and isinstance(value, str) else moved(value)
+                for key, value in node.items()
+            }
+
+        tables = self.scene.model_dump(mode="json", exclude_unset=True, exclude_none=True)
+        return replace(self, tables=(files := moved(tables)), scene=validate_scene(files, self.folder))
 
 
 def change_keys(tables: Tables, changes: Mapping[str, Any]) -> None:
