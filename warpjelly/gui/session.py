@@ -5,10 +5,8 @@ from __future__ import annotations
 import atexit
 import logging
 import threading
-import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, TypeVar
@@ -16,18 +14,15 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from ..device import choose_device
-from ..errors import DivergedError, InputError, WarpjellyError, verdict
-from ..grip import Grip
-from ..model import Body
+from ..errors import InputError, WarpjellyError, verdict
 from ..scene import Scene
 from ..scenefile import load_scene
 from ..scenewriter import require_scene_file, write_scene
-from ..simulator import REST_BLOCK, Simulator
-from ..stability import evaluations
-from ..starts import warn_of_deep_starts
-from ..stepping import capture_lock
-from .carrying import carry_hold, carry_over, center_of_mass, move_body
-from .recording import Place, Recording, shown_by
+from ..simulator import Simulator
+from .hearing import heard
+from .limits import LimitSearch
+from .live import Live
+from .recording import Place, shown_by
 from .setup import (
     DEFAULT_COLLIDERS,
     DEFAULT_TABLES,
@@ -40,33 +35,21 @@ from .setup import (
     entry_named,
     move_start,
 )
-from .snapshot import Energies, Limits, Message, Pull, Recorded, Snapshot
+from .snapshot import Energies, Limits, Message, Snapshot
 from .uploads import Uploads
 
 log = logging.getLogger("warpjelly")
 
 Result = TypeVar("Result")
 
-# Viewers get at most so many snapshots a second.
-SNAPSHOT_RATE = 30.0
-# A substep that takes longer than this is taken alone, s, so that what is asked for need not wait for a block of them.
-LONG_SUBSTEP = 2e-3
-# What does not move the simulation on takes at most this share of the time: making snapshots; measuring energies.
-SNAPSHOT_SHARE, ENERGY_SHARE = 0.25, 0.05
-# Where simulated time is farther behind than this, the rest is given up rather than made up for, s.
-MOST_BEHIND = 0.1
-# Speeds are means over so long, s.
-RATE_WINDOW = 1.0
-# Larger set-ups get no limits: so many springs, times evaluations of their forces, take some ten seconds.
-MOST_EVALUATIONS = 1e9
+# Simulated over real time, at most.
+MOST_SPEED = 1000.0
 # Kinds of commands of which only the last is carried out where several follow each other.
 EDIT, MOVE_HAND = "edit", "move hand"
 # Points of the energy plot, and messages, that are kept.
 HISTORY, MESSAGES = 2000, 100
-
-
-class _UnwantedError(Exception):
-    """The set-up whose limits were looked for is not there any more."""
+# A message that is among so many last ones is not repeated.
+REPEATED = 10
 
 
 @dataclass
@@ -98,44 +81,29 @@ class Session:
     """
 
     def __init__(self, scene: Scene | None = None, *, device: str = "auto") -> None:
-        self._device = choose_device(device)
-        self._changed = threading.Condition()
+        # Whoever edits has this, so that each edit starts from the one before.
         self._editing = threading.RLock()
-        # Guarded by _changed: what is asked for, and what is shown.
+        # Whoever reads or changes what follows has this, and is told of changes.
+        self._changed = threading.Condition()
         self._commands: deque[_Command] = deque()
         self._messages: deque[Message] = deque(maxlen=MESSAGES)
         self._message_count = 0
         self._history: deque[Energies] = deque(maxlen=HISTORY)
-        self._failure: BaseException | None = None
-        self._busy = True
-        self._closing = False
-        self._speed = 1.0
-        self._snapshot: Snapshot | None = None
-        # Of the thread alone.
-        self._setup = SetUp.of(DEFAULT_TABLES, Path.cwd()) if scene is None else SetUp.from_scene(scene)
-        # Guarded by _editing for whoever edits, and by _changed.
-        self._wanted = self._setup
-        self._sim = Simulator(self._setup.plan, device=self._device, interactive=True)
-        self._stale = False
-        self._recording: Recording | None = None
-        self._uploads = Uploads()
-        self._revision = 1
-        self._playing = self._diverged = False
-        self._dirty = True
-        self._anchor = 0.0, 0.0
-        self._substep_seconds = 0.0
-        self._rates: deque[tuple[float, float, int]] = deque()
-        self._next_snapshot = self._next_energies = 0.0
         self._limits: Limits | None = None
-        self._seeker: threading.Thread | None = None
-        self._told: set[str] = set()
-        self._energies = self._measure()
-        self._warn_of_start()
+        self._failure: WarpjellyError | None = None
+        self._snapshot: Snapshot | None = None
+        self._busy, self._closing = True, False
+        self._uploads = Uploads()
+        self._search: LimitSearch | None = None
+        chosen = choose_device(device)
+        with heard(self.tell):
+            self._wanted = SetUp.of(DEFAULT_TABLES, Path.cwd()) if scene is None else SetUp.from_scene(scene)
+        # Of the thread alone, from its start on.
+        self._live = Live(self._wanted, device=chosen, tell=self.tell, rebuilt=self._seek_limits)
         self._publish()
-        self._seek_limits()
         self._thread = threading.Thread(target=self._run, name="warpjelly session", daemon=True)
         self._thread.start()
-        # A thread that were stepping while Python ends would crash.
+        # A thread that still stepped while Python ends would crash.
         atexit.register(self.close)
 
     def __enter__(self) -> Self:
@@ -161,18 +129,13 @@ class Session:
     @property
     def speed(self) -> float:
         """Simulated time over real time that is aimed at while playing."""
-        return self._speed
+        return self._live.pace.speed
 
     @speed.setter
     def speed(self, factor: float) -> None:
-        if not 0.0 < factor <= 1000.0:
-            raise InputError(f"speed = {factor:g}: must be above 0 and at most 1000 times real time")
-
-        def change() -> None:
-            self._speed = float(factor)
-            self._set_anchor()
-
-        self._submit(_Command(change))
+        if not 0.0 < factor <= MOST_SPEED:
+            raise InputError(f"speed = {factor:g}: must be above 0, and at most {MOST_SPEED:g} times real time")
+        self._ask(lambda: self._live.set_speed(float(factor)))
 
     def latest(self) -> Snapshot:
         """Return the newest snapshot."""
@@ -219,70 +182,59 @@ class Session:
             return self._snapshot
 
     def tell(self, text: str, level: str = "info") -> None:
-        """Add a message for all viewers."""
+        """Add a message for all viewers; not again what is among the last ones.
+
+        Args:
+            text: one line.
+            level: info, warning or error.
+        """
         with self._changed:
+            if text in [message.text for message in list(self._messages)[-REPEATED:]]:
+                return
             self._message_count += 1
             self._messages.append(Message(self._message_count, level, text))
             if self._snapshot is not None:
-                self._show(replace(self._snapshot, messages=tuple(self._messages)))
+                self._show(self._snapshot)
 
     # Time.
 
     def play(self) -> None:
         """Let time go on."""
-
-        def play() -> None:
-            self._require_sound()
-            self._start()
-            self._playing = self._dirty = True
-            self._set_anchor()
-
-        self._submit(_Command(play))
+        self._submit(_Command(self._live.play))
 
     def pause(self) -> None:
         """Hold time."""
-
-        def pause() -> None:
-            self._playing, self._dirty = False, True
-
-        self._submit(_Command(pause))
+        self._submit(_Command(self._live.pause))
 
     def step(self, substeps: int = 1) -> None:
         """Hold time, and go on by some substeps."""
         if substeps < 1:
             raise InputError(f"substeps = {substeps}: must be at least 1")
-
-        def step() -> None:
-            self._require_sound()
-            self._start()
-            self._playing, self._dirty = False, True
-            self._go_on(substeps)
-            self._look_after()
-
-        self._submit(_Command(step))
+        self._submit(_Command(lambda: self._live.step(substeps)))
 
     def reset(self) -> None:
-        """Go back to time zero of the set-up; it goes on playing if it does, unless it has diverged."""
+        """Go back to time zero of the set-up; it goes on playing if it does, unless it has diverged.
 
-        def reset() -> None:
-            if self._recording is not None:
-                raise InputError(f"recording to {self._recording.place.folder}; stop the recording first")
-            self._rebuild(carry=False)
-
-        self._submit(_Command(reset))
+        Raises:
+            InputError: a recording is going.
+        """
+        self._ask(self._live.reset)
 
     def close(self) -> None:
         """End the simulation and its thread; a recording is finished, files that were sent are removed."""
         atexit.unregister(self.close)
-        with suppress(InputError):
-            self.stop_recording()
-        with self._changed:
-            self._closing = True
-            self._changed.notify_all()
-        self._thread.join()
-        if self._seeker is not None:
-            self._seeker.join()
-        self._uploads.close()
+        try:
+            if self._live.recording is not None:
+                self.stop_recording()
+        finally:
+            with self._changed:
+                self._closing = True
+                self._changed.notify_all()
+            self._thread.join()
+            if self._search is not None:
+                self._search.stop()
+                self._search.join()
+            self._uploads.close()
 
     # The set-up.
 
@@ -371,17 +323,16 @@ class Session:
         self.take(load_scene(path))
 
     def take(self, scene: Scene) -> None:
-        """Take a scene as the set-up, held at time zero."""
+        """Take a scene as the set-up, held at time zero.
+
+        Raises:
+            InputError: the scene cannot be built.
+        """
         with self._editing:
-            with self._heard():
+            with heard(self.tell):
                 setup = SetUp.from_scene(scene)
             self._require_recordable(setup.scene)
-
-            def begin() -> None:
-                self._playing = False
-                self._apply(setup, carry=False)
-
-            self._submit(_Command(begin), setup)
+            self._submit(_Command(lambda: self._live.apply(setup, carry=False)), setup)
 
     # Moving bodies by hand.
 
@@ -406,23 +357,14 @@ class Session:
         """
         if (by is None) == (to is None):
             raise InputError("teleport: give by or to")
+        displacement = _vector("teleport", to if by is None else by)
         with self._editing:
             entry_named(self._wanted.tables, "bodies", body)
-            if to is not None:
-                place = _vector("teleport", to)
-                by = (place - self._ask(lambda: center_of_mass(self._sim, self._body(body)))).tolist()
-            displacement = _vector("teleport", () if by is None else by)
+            if by is None:
+                displacement = displacement - self._ask(lambda: self._live.center(body))
             setup = self._wanted.edited(lambda tables: move_start(tables, body, displacement))
-
-            def move() -> None:
-                self._setup = setup
-                self._revision += 1
-                move_body(self._sim, body, displacement, at_rest=at_rest)
-                # At time zero the set-up says exactly where bodies are.
-                self._stale = self._sim.substep_count == 0
-                self._dirty = True
-
-            self._submit(_Command(move), setup)
+            move = _Command(lambda: self._live.move_body(setup, body, displacement, at_rest=at_rest))
+            self._submit(move, setup)
 
     def grab(self, body: str, point: Sequence[float]) -> None:
         """Take hold of the particles of a body that are nearest to a point, and of nothing else.
@@ -435,33 +377,18 @@ class Session:
             InputError: there is no such body, or all of it is pinned.
         """
         place = _vector("grab", point)
-        entry_named(self._wanted.tables, "bodies", body)
-
-        def grab() -> None:
-            self._grip.grab(body, place)
-            self._dirty = True
-
-        self._ask(grab)
+        with self._editing:
+            entry_named(self._wanted.tables, "bodies", body)
+            self._ask(lambda: self._live.grab(body, place))
 
     def drag(self, point: Sequence[float]) -> None:
         """Move the hand to a point [3], m: what it holds is pulled there by a damped spring, if it holds anything."""
         hand = _vector("drag", point)
-
-        def move() -> None:
-            if self._grip.hold is not None:
-                self._grip.move(hand)
-                self._dirty = True
-
-        self._submit(_Command(move, MOVE_HAND))
+        self._submit(_Command(lambda: self._live.drag(hand), MOVE_HAND))
 
     def release(self) -> None:
         """Let go of what is held."""
-
-        def release() -> None:
-            self._grip.release()
-            self._dirty = True
-
-        self._submit(_Command(release))
+        self._submit(_Command(self._live.release))
 
     # What lasts.
 
@@ -515,18 +442,11 @@ class Session:
             EnvironmentFailedError: it cannot be written to.
         """
         with self._editing:
-            if self._recording is not None:
-                raise InputError(f"recording to {self._recording.place.folder} already; stop that first")
+            if (going := self._live.recording) is not None:
+                raise InputError(f"recording to {going.place.folder} already; stop that first")
             place = Place(Path(directory), force=force)
-
-            def begin() -> None:
-                self._require_sound()
-                self._start()
-                self._recording = Recording(place, self._sim, self._setup.scene)
-                self._dirty = True
-
             try:
-                self._ask(begin)
+                self._ask(lambda: self._live.record(place))
             except BaseException:
                 place.close()
                 raise
@@ -542,10 +462,9 @@ class Session:
             EnvironmentFailedError: not all could be written; what could is in the run directory.
         """
         with self._editing:
-            recording = self._recording
-            if recording is None:
+            if (recording := self._live.recording) is None:
                 raise InputError("no recording is going")
-            self._ask(self._end_recording)
+            self._ask(self._live.end_recording)
         record = recording.wait()
         self.tell(f"recorded {recording.frames} frames into {recording.place.folder}")
         return record
@@ -556,33 +475,17 @@ class Session:
         """Check an edit of the tables, have it carried out, and return what the edit does."""
         with self._editing:
             results: list[Result] = []
-            with self._heard():
+            with heard(self.tell):
                 setup = self._wanted.edited(lambda tables: results.append(edit(tables)))
             self._require_recordable(setup.scene)
-            self._submit(_Command(lambda: self._apply(setup, carry=True), EDIT), setup)
+            self._submit(_Command(lambda: self._live.apply(setup, carry=True), EDIT), setup)
             return results[0]
 
     def _require_recordable(self, scene: Scene) -> None:
         """Refuse an edit that a recording could not show."""
-        if self._recording is not None and shown_by(scene) != self._recording.shown:
-            folder = self._recording.place.folder
+        if (recording := self._live.recording) is not None and shown_by(scene) != recording.shown:
+            folder = recording.place.folder
             raise InputError(f"recording to {folder}, whose stage cannot show this change; stop the recording first")
-
-    @contextmanager
-    def _heard(self) -> Iterator[None]:
-        """Tell viewers of what is warned of in this thread."""
-        thread, heard = threading.get_ident(), logging.Handler(logging.WARNING)
-        texts: list[str] = []
-        heard.emit = lambda record: texts.append(record.getMessage()) if record.thread == thread else None  # type: ignore[method-assign]
-        log.addHandler(heard)
-        try:
-            yield
-        finally:
-            log.removeHandler(heard)
-        for text in texts:
-            if text not in self._told:
-                self.tell(text, "warning")
-        self._told = set(texts)
 
     def _submit(self, command: _Command, wanted: SetUp | None = None) -> None:
         with self._changed:
@@ -590,9 +493,9 @@ class Session:
                 raise InputError("the session is closed")
             if command.kind and self._commands and self._commands[-1].kind == command.kind:
                 self._commands.pop()
-            self._commands.append(command)
             if wanted is not None:
                 command.edits, self._wanted = True, wanted
+            self._commands.append(command)
             self._changed.notify_all()
 
     def _ask(self, question: Callable[[], Result]) -> Result:
@@ -604,7 +507,7 @@ class Session:
         def answer() -> None:
             try:
                 answers.append(question())
-            except WarpjellyError as error:
+            except BaseException as error:
                 failures.append(error)
             finally:
                 answered.set()
@@ -618,31 +521,38 @@ class Session:
     # The thread.
 
     def _run(self) -> None:
-        while True:
-            with self._changed:
-                if not self._commands:
-                    self._busy = False
-                    self._changed.notify_all()
-                    if not self._playing:
-                        self._changed.wait_for(lambda: self._commands or self._closing)
-                    elif not self._closing and (idle := self._idle_seconds()) > 0.0:
-                        self._changed.wait_for(lambda: self._commands or self._closing, idle)
-                if self._closing:
-                    self._commands.clear()
-                    self._busy = False
-                    self._changed.notify_all()
-                    return
-                command = self._commands.popleft() if self._commands else None
-                self._busy = True
+        while (command := self._next_command()) is not None:
             try:
-                if command is not None:
-                    command.run()
-                elif self._playing:
-                    self._advance()
-                if self._dirty or (self._playing and time.perf_counter() >= self._next_snapshot):
-                    self._publish()
+                command.run()
+                self._publish()
             except BaseException as error:
                 self._fail(error)
+
+    def _next_command(self) -> _Command | None:
+        """Wait for something to do, which is to go on where nothing else is asked for; None to end."""
+        with self._changed:
+            if not self._commands:
+                self._busy = False
+                self._changed.notify_all()
+                idle = max(self._live.idle_seconds(), 0.0) if self._live.playing else None
+                self._changed.wait_for(lambda: self._commands or self._closing, idle)
+            # Whoever waits for commands is not left waiting: they come before the end.
+            if self._commands:
+                self._busy = True
+                return self._commands.popleft()
+            return None if self._closing else _Command(self._live.advance)
+
+    def _publish(self) -> None:
+        """Hand out a snapshot if one is due."""
+        if (snapshot := self._live.snapshot()) is None:
+            return
+        with self._changed:
+            energies, history = snapshot.energies, self._history
+            if history and history[-1].time > energies.time:
+                history.clear()
+            if not history or history[-1].time < energies.time:
+                history.append(energies)
+            self._show(snapshot)
 
     def _fail(self, error: BaseException) -> None:
         """Note that something went wrong, hold time, and take back edits that could not be carried out."""
@@ -652,242 +562,36 @@ class Session:
         with self._changed:
             self._failure = self._failure or (error if isinstance(error, WarpjellyError) else WarpjellyError(text))
             if not any(command.edits for command in self._commands):
-                self._wanted = self._setup
-        self._playing = False
+                self._wanted = self._live.setup
+        self._live.pause()
         self.tell(text, "error")
         self._publish()
 
-    def _advance(self) -> None:
-        """Go on by some substeps, if they are due."""
-        began = time.perf_counter()
-        if self._sim.time > self._due(began):
-            return
-        count = 1 if self._substep_seconds > LONG_SUBSTEP else REST_BLOCK
-        self._go_on(count)
-        ended = time.perf_counter()
-        self._substep_seconds = (ended - began) / count
-        if self._due(ended) - self._sim.time > MOST_BEHIND * self._speed:
-            self._set_anchor()
-
-    def _go_on(self, substeps: int) -> None:
-        """Take some substeps, and the samples of a recording among them."""
-        while substeps > 0:
-            count = substeps if self._recording is None else min(substeps, self._recording.missing)
-            self._sim.step(count)
-            substeps -= count
-            if self._recording is not None:
-                try:
-                    self._recording.advanced(self._sim, count)
-                except WarpjellyError:
-                    self._abandon_recording()
-                    raise
-
-    def _end_recording(self) -> None:
-        """Take no more samples."""
-        recording, self._recording, self._dirty = self._recording, None, True
-        if recording is not None:
-            recording.finish(self._sim, diverged=self._diverged)
-
-    def _abandon_recording(self) -> None:
-        """Give up what could not be written; what was written stays."""
-        recording, self._recording = self._recording, None
-        if recording is not None:
-            with suppress(WarpjellyError):
-                recording.wait()
-
-    def _due(self, now: float) -> float:
-        """Return the simulated time that belongs to a moment while playing, s."""
-        wall, simulated = self._anchor
-        return simulated + (now - wall) * self._speed
-
-    def _set_anchor(self) -> None:
-        """Count what is due from now on."""
-        self._anchor = time.perf_counter(), self._sim.time
-
-    def _idle_seconds(self) -> float:
-        """Return for how long there is nothing to do while playing, s."""
-        now = time.perf_counter()
-        step = (self._sim.time - self._due(now)) / self._speed
-        return min(step, self._next_snapshot - now)
-
-    def _start(self) -> None:
-        """Get ready to leave time zero."""
-        if self._stale:
-            self._rebuild(carry=False)
-
-    def _require_sound(self) -> None:
-        if self._diverged:
-            raise InputError("the simulation has diverged: reset it, after lowering solver.dt or stiffness")
-
-    def _look_after(self) -> None:
-        """Hold time if the simulation diverged."""
-        try:
-            self._sim.require_sane()
-        except DivergedError as error:
-            self._playing, self._diverged, self._dirty = False, True, True
-            self.tell(f"{error}; this is the last good moment", "error")
-            if (recording := self._recording) is not None:
-                self._end_recording()
-                recording.wait()
-                self.tell(f"recorded {recording.frames} frames into {recording.place.folder}")
-
-    def _apply(self, setup: SetUp, *, carry: bool) -> None:
-        """Simulate another set-up."""
-        before, self._setup = self._setup, setup
-        try:
-            self._rebuild(carry=carry)
-        except BaseException:
-            self._setup = before
-            raise
-
-    def _rebuild(self, *, carry: bool) -> None:
-        sim = Simulator(self._setup.plan, device=self._device, interactive=True)
-        if self._diverged:
-            self._playing = False
-        elif carry and self._sim.substep_count > 0:
-            carry_over(self._sim, sim)
-        if carry and not self._diverged:
-            carry_hold(self._sim, sim)
-        if sim.substep_count == 0:
-            with self._changed:
-                self._history.clear()
-        self._sim, self._stale, self._diverged, self._dirty = sim, False, False, True
-        self._revision += 1
-        self._substep_seconds = 0.0
-        self._set_anchor()
-        self._warn_of_start()
-        self._seek_limits()
-
-    def _warn_of_start(self) -> None:
-        """Tell of bodies that start in colliders or in each other."""
-        if self._sim.substep_count == 0:
-            with self._heard():
-                warn_of_deep_starts(self._sim)
-
-    def _seek_limits(self) -> None:
-        """Find the largest stable step of the set-up, in a thread of its own."""
-        sim = self._sim
-        self._limits = None
-
-        def require_wanted() -> None:
-            if self._sim is not sim or self._closing:
-                raise _UnwantedError
-
-        def seek() -> None:
-            if evaluations(sim.model) * sim.model.spring_count > MOST_EVALUATIONS:
-                return
-            name = sim.scene.solver.integrator
-            try:
-                springs, contact = (sim.step_limits(contacts=on, wanted=require_wanted)[name] for on in (False, True))
-            except _UnwantedError:
-                return
-            with capture_lock:
-                limits = Limits(springs, contact, sim.broken_limit())
-            with self._changed:
-                if self._sim is sim:
-                    self._limits = limits
-                    assert self._snapshot is not None
-                    self._show(replace(self._snapshot, limits=limits))
-
-        self._seeker = threading.Thread(target=seek, name="warpjelly limits", daemon=True)
-        self._seeker.start()
-
-    @property
-    def _grip(self) -> Grip:
-        assert self._sim.grip is not None
-        return self._sim.grip
-
-    def _body(self, name: str) -> Body:
-        return next(body for body in self._sim.model.bodies if body.name == name)
-
-    # What is shown.
-
-    def _measure(self) -> Energies:
-        figures = self._sim.diagnostics()
-        names = ("kinetic", "elastic", "potential", "contact")
-        return Energies(self._sim.time, **{name: figures[name] for name in names})
-
-    def _pull(self) -> Pull | None:
-        grip = self._grip
-        if (hold := grip.hold) is None:
-            return None
-        return Pull(hold.body, grip.point(), hold.hand, grip.force())
-
-    def _publish(self) -> None:
-        """Make a snapshot of the present, or of the last good moment."""
-        began = time.perf_counter()
-        if self._playing:
-            self._look_after()
-        sim, shown = self._sim, self._snapshot
-        rates = self._update_rates(began)
-        if self._diverged and shown is not None:
-            snapshot = replace(shown, playing=False, diverged=True, substeps_per_second=0.0, real_time=0.0)
-        else:
-            if self._dirty or began >= self._next_energies:
-                self._energies = self._measure()
-                now = time.perf_counter()
-                self._next_energies = now + (now - began) / ENERGY_SHARE
-                with self._changed:
-                    if not self._history or self._history[-1].time < self._energies.time:
-                        self._history.append(self._energies)
-            snapshot = Snapshot(
-                number=0,
-                revision=self._revision,
-                scene=self._setup.scene,
-                bodies=tuple(sim.model.bodies),
-                shapes=tuple(sim.model.shapes),
-                frames=tuple(sim.shapes()),
-                centers={body.name: center_of_mass(sim, body) for body in sim.model.bodies},
-                time=sim.time,
-                dt=sim.dt,
-                playing=self._playing,
-                diverged=False,
-                energies=self._energies,
-                substeps_per_second=rates[0],
-                real_time=rates[1],
-                particles=sim.model.particle_count,
-                springs=sim.model.spring_count,
-                limits=None,
-                pull=self._pull(),
-                recording=None,
-                messages=(),
-            )
-        ended = time.perf_counter()
-        self._next_snapshot = max(began + 1.0 / SNAPSHOT_RATE, ended + (ended - began) / SNAPSHOT_SHARE)
-        self._dirty = False
-        recording = None
-        if self._recording is not None:
-            recording = Recorded(self._recording.place.folder, self._recording.frames)
+    def _seek_limits(self, sim: Simulator) -> None:
+        """Look for the largest stable step of a simulator, and no more for that of the one before."""
+        if self._search is not None:
+            self._search.stop()
         with self._changed:
-            self._show(replace(snapshot, limits=self._limits, recording=recording, messages=tuple(self._messages)))
+            self._limits = None
+        self._search = search = LimitSearch(sim, lambda limits: self._take_limits(search, limits))
 
-    def _update_rates(self, now: float) -> tuple[float, float]:
-        """Return substeps per second and simulated over real time, means over the last moments of playing."""
-        if not self._playing:
-            self._rates.clear()
-            return 0.0, 0.0
-        rates = self._rates
-        if rates and rates[-1][2] > self._sim.substep_count:
-            rates.clear()
-        rates.append((now, self._sim.time, self._sim.substep_count))
-        while rates[0][0] < now - RATE_WINDOW and len(rates) > 2:
-            rates.popleft()
-        wall = now - rates[0][0]
-        if wall <= 0.0:
-            return 0.0, 0.0
-        return (rates[-1][2] - rates[0][2]) / wall, (rates[-1][1] - rates[0][1]) / wall
+    def _take_limits(self, search: LimitSearch, limits: Limits) -> None:
+        with self._changed:
+            if search is self._search and self._snapshot is not None:
+                self._limits = limits
+                self._show(self._snapshot)
 
     def _show(self, snapshot: Snapshot) -> None:
-        """Hand out a snapshot; to be called with the lock."""
+        """Hand out a snapshot with what is known besides; to be called with the lock."""
         number = 1 if self._snapshot is None else self._snapshot.number + 1
-        self._snapshot = replace(snapshot, number=number)
+        self._snapshot = replace(snapshot, number=number, limits=self._limits, messages=tuple(self._messages))
         self._changed.notify_all()
 
     def _is_newer(self, number: int) -> bool:
         return self._snapshot is not None and self._snapshot.number > number
 
 
-def _vector(what: str, given: Sequence[float]) -> np.ndarray:
+def _vector(what: str, given: Sequence[float] | None) -> np.ndarray:
     """Return three finite numbers as an array.
 
     Raises:

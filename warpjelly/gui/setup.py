@@ -21,12 +21,13 @@ Tables = dict[str, Any]
 # What there is when no scene is given: the cube of the thesis "Gelatin Cubes" (USI, 2023) over a floor.
 DEFAULT_TABLES: Tables = {
     "name": "jelly",
+    "solver": {"dt": 5e-4},
     "materials": {
         "jelly": {
             "particle_mass": 0.01,
-            "structural": {"stiffness": 100.0, "damping": 0.05},
-            "shear": {"stiffness": 100.0, "damping": 0.05},
-            "bend": {"stiffness": 100.0, "damping": 0.05},
+            "structural": {"stiffness": 100.0, "damping": 0.2},
+            "shear": {"stiffness": 100.0, "damping": 0.2},
+            "bend": {"stiffness": 100.0, "damping": 0.2},
         }
     },
     "bodies": [
@@ -34,11 +35,11 @@ DEFAULT_TABLES: Tables = {
             "name": "cube",
             "type": "cube",
             "material": "jelly",
-            "position": [0.0, 1.5, 0.0],
+            "position": [0.0, 1.4, 0.0],
             "rotation": [0.0, 25.0, 10.0],
         }
     ],
-    "colliders": [{"name": "floor", "type": "plane", "normal": [0.0, 1.0, 0.0], "size": [10.0, 10.0]}],
+    "colliders": [{"name": "floor", "type": "plane", "normal": [0.0, 1.0, 0.0], "size": [10.0, 10.0], "damping": 10.0}],
 }
 # What a new collider is unless something else is said of it, by type; directions and places are for Y up.
 DEFAULT_COLLIDERS: dict[str, Tables] = {

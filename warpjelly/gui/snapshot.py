@@ -82,8 +82,6 @@ class Message:
 class Snapshot:
     """What a session shows at a moment; immutable, and so are its arrays."""
 
-    number: int
-    """Ascending from 1 with each snapshot."""
     revision: int
     """Ascending with each set-up: where it is the same, so are scene, shapes (topology) and bodies."""
     scene: Scene
@@ -111,11 +109,13 @@ class Snapshot:
     """Simulated over real time, as reached; 0 unless it plays."""
     particles: int
     springs: int
-    limits: Limits | None
-    """None while they are looked for, and where that would take too long."""
     pull: Pull | None
     """What is grabbed, if anything is."""
     recording: Recorded | None
     """Of the recording that is going, if one is."""
-    messages: tuple[Message, ...]
+    number: int = 0
+    """Ascending from 1 with each snapshot."""
+    limits: Limits | None = None
+    """None while they are looked for, and where that would take too long."""
+    messages: tuple[Message, ...] = ()
     """The last ones, oldest first."""
