@@ -78,8 +78,8 @@ class Grip:
         # Particles at one distance by their numbers, so that the same are held each time.
         nearest = np.sort(np.argsort(distance, kind="stable")[:count])
         # Firmly in the middle, hardly at the rim.
-        reach = distance[nearest].max() * (1.0 + 1.0 / count)
-        weights = 1.0 - (distance[nearest] / reach) ** 2 if reach > 0.0 else np.ones(count)
+        beyond = distance[nearest] ** 2 - distance[nearest].min() ** 2
+        weights = 1.0 - beyond / (beyond.max() * (1.0 + 1.0 / count) or 1.0)
         self._take(Hold(body, free[nearest], weights, away[:, nearest], point))
 
     def move(self, hand: np.ndarray) -> None:

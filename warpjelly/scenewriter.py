@@ -55,12 +55,16 @@ def format_tables(data: Mapping[str, Any]) -> str:
     lines = _lines({key: value for key, value in data.items() if key not in tables | lists})
     for key, table in tables.items():
         # Materials are tables by name.
-        named = {f"{key}.{_key(name)}": entry for name, entry in table.items()} if key == "materials" else {key: table}
+        named = (
+            {f"{key}.{_key(name)}": entry for name, entry in table.items()}
+            if key == "materials"
+            else {_key(key): table}
+        )
         for header, entry in named.items():
             lines += ["", f"[{header}]", *_lines(entry)]
     for key, entries in lists.items():
         for entry in entries:
-            lines += ["", f"[[{key}]]", *_lines(entry)]
+            lines += ["", f"[[{_key(key)}]]", *_lines(entry)]
     return "\n".join(lines).lstrip("\n") + "\n"
 
 

@@ -164,9 +164,13 @@ def _carry_contacts(old: Simulator, new: Simulator, pairs: list[tuple[Body, Body
                 held = _held(old, slot_before)[mine].copy()
             if isinstance(collider, PlaneCollider):
                 below, beside = _depths(collider, x_before[:, mine])
-                # A plane meets what it is moved through, unless it leaps; and a new one what touches it, as at a start.
-                was_in_front = isinstance(was, PlaneCollider) and _depths(was, x_before[:, mine])[0] <= 0.0
-                held |= (was_in_front if isinstance(was, PlaneCollider) else True) & (below <= collider.threshold)
+                if not (isinstance(was, PlaneCollider) and _stands(was, collider)):
+                    # A plane meets what it is moved through, unless it leaps; a new one what touches it, as at a start.
+                    if isinstance(was, PlaneCollider):
+                        held |= _depths(was, x_before[:, mine])[0] <= 0.0
+                    else:
+                        held[:] = True
+                    held &= below <= collider.threshold
                 held &= ~beside & (below >= 0.0)
             elif slot_before >= 0:
                 three = slice(3 * slot, 3 * slot + 3)
@@ -175,6 +179,12 @@ def _carry_contacts(old: Simulator, new: Simulator, pairs: list[tuple[Body, Body
     for array, values in ((new.state.stamps, stamps), (new.state.normals, normals)):
         if values.size:
             array.assign(values)
+
+
+def _stands(was: PlaneCollider, collider: PlaneCollider) -> bool:
+    """Say whether a plane is where it was."""
+    keys = ("center", "normal", "tangent", "size")
+    return all(getattr(was, key) == getattr(collider, key) for key in keys)
 
 
 def _side(collider: HalfSpaceCollider, center: np.ndarray) -> float:

@@ -19,18 +19,21 @@ class _UnwantedError(Exception):
 
 
 class LimitSearch:
-    """A search, in a thread of its own.
+    """A search, in a thread of its own from ``start`` on.
 
     Args:
         sim: whose limits; interactive, so that they may be asked for while it steps.
-        found: called with them, in that thread.
+        found: called with this search and the limits, in that thread.
     """
 
-    def __init__(self, sim: Simulator, found: Callable[[Limits], None]) -> None:
+    def __init__(self, sim: Simulator, found: Callable[[LimitSearch, Limits], None]) -> None:
         self._sim = sim
         self._found = found
         self._stopped = False
         self._thread = threading.Thread(target=self._seek, name="warpjelly limits", daemon=True)
+
+    def start(self) -> None:
+        """Begin."""
         self._thread.start()
 
     def stop(self) -> None:
@@ -53,7 +56,7 @@ class LimitSearch:
         with capture_lock:
             limits = Limits(springs, contact, sim.broken_limit())
         if not self._stopped:
-            self._found(limits)
+            self._found(self, limits)
 
     def _require_wanted(self) -> None:
         if self._stopped:

@@ -185,7 +185,8 @@ class Live:
         if self.playing:
             self._look_after()
         if self._diverged and self._good is not None:
-            snapshot = replace(self._good, playing=False, diverged=True, substeps_per_second=0.0, real_time=0.0)
+            held = replace(self._good, playing=False, substeps_per_second=0.0, real_time=0.0)
+            snapshot = replace(held, diverged=True, recording=None)
         else:
             snapshot = self._good = self._show(began)
         ended = time.perf_counter()

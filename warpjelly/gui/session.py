@@ -573,13 +573,15 @@ class Session:
             self._search.stop()
         with self._changed:
             self._limits = None
-        self._search = search = LimitSearch(sim, lambda limits: self._take_limits(search, limits))
+            self._search = LimitSearch(sim, self._take_limits)
+        self._search.start()
 
     def _take_limits(self, search: LimitSearch, limits: Limits) -> None:
         with self._changed:
-            if search is self._search and self._snapshot is not None:
+            if search is self._search:
                 self._limits = limits
-                self._show(self._snapshot)
+                if self._snapshot is not None:
+                    self._show(self._snapshot)
 
     def _show(self, snapshot: Snapshot) -> None:
         """Hand out a snapshot with what is known besides; to be called with the lock."""
