@@ -12,6 +12,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,12 +21,14 @@ from typing import Any
 
 import pytest
 import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from runs import CUBE, samples_of
 
 import warpjelly as wj
-from warpjelly.batch import pool
+from warpjelly.batch import ledger, pool
 from warpjelly.batch.batch import RunsFailedError, estimate_batch, run_batch
 from warpjelly.batch.display import Live
 from warpjelly.batch.jobs import Job, Result, Watcher
@@ -402,6 +405,79 @@ def test_finished_runs_are_known_by_what_they_simulate(base, tmp_path):
     assert [run["attempts"] for run in batch.record["runs"]] == [0, 0, 0]
     batch = run_batch(other, output=folder, engine=Here(), force=True)
     assert [run["attempts"] for run in batch.record["runs"]] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("values", [[40, 50, 60, 70], [70, 50], [60, 50, 70, 40]])
+def test_finished_runs_are_known_where_names_have_changed_places(base, tmp_path, values):
+    """Number the runs, and resume with a value before the old ones, in another order, and fewer: none is done twice."""
+    folder = tmp_path / "out"
+
+    def numbered(values: list[float]) -> Sweep:
+        return make_sweep(base, values).model_copy(update={"name": "{number}"})
+
+    run_batch(numbered([50, 60, 70]), output=folder, engine=Here())
+    before = {value: samples_of(folder / str(number)) for number, value in enumerate((50, 60, 70), 1)}
+    batch = run_batch(numbered(values), output=folder, engine=Here(), resume=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [int(value not in before) for value in values]
+    for run, value in zip(batch.record["runs"], values, strict=True):
+        assert run["scene_hash"] == json.loads((folder / run["name"] / "run.json").read_text())["scene_hash"]
+        assert value not in before or samples_of(folder / run["name"]) == before[value]
+    # Those that are not asked for are still there.
+    assert len(list(folder.glob("*/stage.usdc"))) == len({50, 60, 70, *values})
+    # One for which there is no place any more is only replaced if that is asked for.
+    fewer = numbered([30, *values[:-1]])
+    with pytest.raises(InputError, match="holds a finished run of another scene"):
+        run_batch(fewer, output=folder, engine=Here(), resume=True)
+    batch = run_batch(fewer, output=folder, engine=Here(), resume=True, force=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [1, *[0] * len(values[:-1])]
+
+
+@given(
+    there=st.lists(st.sampled_from("ABCD?"), max_size=5),
+    wanted=st.lists(st.sampled_from("ABCDE"), max_size=5),
+)
+def test_folders_change_places_without_losing_any(there, wanted):
+    """Have folders with finished and other contents, and ask for some under any names: all are kept, and each found."""
+    with tempfile.TemporaryDirectory() as place, pytest.MonkeyPatch.context() as patch:
+        folder = Path(place)
+        for number, content in enumerate(there):
+            (folder / str(number)).mkdir()
+            (folder / str(number) / "run.json").write_text(f'"{content}"')
+
+        def content_of(path: Path) -> str:
+            return json.loads((path / "run.json").read_text())
+
+        patch.setattr(ledger, "_finished", lambda path: content if (content := content_of(path)) != "?" else None)
+        hashes = {str(number): content for number, content in enumerate(wanted)}
+        finished, places = ledger._find_finished(folder, hashes)
+        ledger._move(folder, places)
+        found = {path.name: content_of(path) for path in folder.iterdir()}
+        assert sorted(found.values()) == sorted(there)
+        assert {name for name, content in hashes.items() if found.get(name) == content} == finished
+        # As many of each scene as there are, or as are asked for, which of equal ones is left to chance.
+        for content in set(wanted):
+            assert sum(hashes[name] == content for name in finished) >= (content in there)
+
+
+def test_what_is_not_whole_is_done_again_and_what_is_no_run_is_left_alone(base, tmp_path):
+    """Take stage, metrics or record from finished runs, and have a folder of something else; the others stay."""
+    folder = tmp_path / "out"
+    values = [50, 60, 70]
+    run_batch(make_sweep(base, values), output=folder, engine=Here())
+    (folder / "k50" / "stage.usdc").unlink()
+    (folder / "k60" / "metrics.csv").unlink()
+    for number, text in enumerate(("{}", "[]", "3", "nothing")):
+        (folder / f"else{number}").mkdir()
+        (folder / f"else{number}" / "run.json").write_text(text)
+    batch = run_batch(make_sweep(base, values), output=folder, engine=Here(), resume=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [1, 1, 0]
+    assert all((folder / run["stage"]).is_file() for run in batch.record["runs"])
+    (folder / "k50" / "run.json").write_text("[]")
+    with pytest.raises(InputError, match=r"out/k50: holds a finished run of another scene or version, or one that can"):
+        run_batch(make_sweep(base, values), output=folder, engine=Here(), resume=True)
+    batch = run_batch(make_sweep(base, values), output=folder, engine=Here(), resume=True, force=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [1, 0, 0]
+    assert (folder / "else1" / "run.json").read_text() == "[]"
 
 
 def test_a_run_that_diverged_is_done_again_and_fails_again(base, tmp_path):
