@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -29,7 +30,8 @@ from runs import CUBE, samples_of
 
 import warpjelly as wj
 from warpjelly.batch import ledger, pool
-from warpjelly.batch.batch import RunsFailedError, estimate_batch, run_batch
+from warpjelly.batch.batch import BatchInterruptedError, RunsFailedError, estimate_batch, run_batch
+from warpjelly.batch.cluster import RayEngine
 from warpjelly.batch.display import Live
 from warpjelly.batch.jobs import Job, Result, Watcher
 from warpjelly.batch.perform import perform
@@ -331,6 +333,33 @@ def test_ctrl_c_ends_runs_after_their_frame_and_resume_goes_on(base, tmp_path, s
     assert_whole(cli.folder, base, values, LONG, tmp_path)
 
 
+def test_a_second_ctrl_c_ends_runs_at_once(base, tmp_path, start):
+    """Interrupt a batch twice whose run does not get to the end of its frame."""
+    cli = start(write_sweep(tmp_path, base, [50, 100], LONG), "--workers=1")
+    worker = cli.wait_for(cli.writer_of("k50"))
+    os.kill(worker, signal.SIGSTOP)
+    cli.process.send_signal(signal.SIGINT)
+    # One that is not heard yet would be the same one.
+    time.sleep(1.0)
+    cli.process.send_signal(signal.SIGINT)
+    code, _, err = cli.end()
+    assert (code, err.splitlines()[-1]) == (130, "error: interrupted")
+    assert not is_alive(worker)
+    assert cli.record()["counts"] == {"runs": 2, "finished": 0, "failed": 0, "unfinished": 2}
+
+
+def test_ctrl_c_while_runs_are_drawn_leaves_a_page_without_pictures(base, tmp_path, monkeypatch):
+    """Interrupt what draws."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warpjelly.previews.thumbnails.draw_thumbnails", interrupted)
+    with pytest.raises(BatchInterruptedError, match="interrupted: 1 of 1 runs are finished"):
+        run_batch(make_sweep(base, [50]), output=tmp_path / "out", engine=Here(), pictures=True)
+    assert "The runs were not drawn" in (tmp_path / "out" / "index.html").read_text()
+
+
 def test_a_run_that_exhausts_memory_leaves_the_others_alone(base, tmp_path, start):
     """Limit memory to what a small run needs and some more, and ask for a body that needs far more than that."""
     probe = (
@@ -480,6 +509,17 @@ def test_what_is_not_whole_is_done_again_and_what_is_no_run_is_left_alone(base, 
     assert (folder / "else1" / "run.json").read_text() == "[]"
 
 
+@pytest.mark.parametrize("name", ["index.html", "batch.csv", "comparison.usda"])
+def test_files_of_others_are_not_replaced(base, tmp_path, name):
+    """Have a file in the folder that a batch would write, of something else."""
+    (tmp_path / name).write_text("mine")
+    for resume in (False, True):
+        with pytest.raises(InputError, match=f"{name}: not of a batch, and a batch would replace it; choose another"):
+            run_batch(make_sweep(base, [50]), output=tmp_path, engine=Here(), resume=resume)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
+
+
 def test_a_run_that_diverged_is_done_again_and_fails_again(base, tmp_path):
     """Resume a batch with a run that diverged."""
     sweep = make_sweep(base, [100, 1e9])
@@ -579,6 +619,7 @@ def test_dry_run_lists_runs_and_what_they_take(base, tmp_path, start):
     assert first.items() >= {"name": "k50", "frames": 10, "particles": 27, "problem": None}.items()
     assert "must be greater" in wrong["problem"]
     assert estimate["memory_bytes"] == first["memory_bytes"] + second["memory_bytes"]
+    assert estimate_batch(make_sweep(base, [50]), workers=9, device="cpu")["workers"] == 1
     assert estimate["seconds"] == pytest.approx(max(first["seconds"], second["seconds"]))
     longer = estimate_batch(make_sweep(base, [50, 100]), frames=19, workers=1, device="cpu")
     assert longer["seconds"] == pytest.approx(sum(run["seconds"] for run in longer["runs"]))
@@ -666,3 +707,16 @@ def test_an_engine_gives_its_gpus_to_the_workers_in_turn(monkeypatch):
     assert LocalEngine(workers=5).workers == 5
     assert LocalEngine(workers=5, most=3).workers == 3
     assert LocalEngine(device="cpu").workers == available_cores()
+    for workers in (0, -1):
+        for make in (LocalEngine, RayEngine):
+            with pytest.raises(InputError, match=f"workers = {workers}: must be at least 1"):
+                make(workers=workers)
+
+
+def test_a_process_may_be_killed_by_a_signal_without_a_name():
+    """Bury a worker that a signal of the system's own has ended."""
+    worker = object.__new__(pool._Worker)
+    worker._ready = True
+    for number, name in ((signal.SIGSEGV, "SIGSEGV"), (35, "signal 35")):
+        worker._process = SimpleNamespace(wait=lambda number=number: -number)  # type: ignore[assignment]
+        assert worker.bury() == f"its process was killed by {name}"

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, Self
 
 from ..errors import EnvironmentFailedError, InputError
-from .jobs import Job, Result, Watcher
+from .jobs import Job, Result, Watcher, require_workers
 from .rayjobs import OTHER_TOKEN, Connected, Ended, Progress, Refused, Remark
 
 # How long a port may take to answer, and the cluster behind it, s.
@@ -61,6 +61,7 @@ class RayEngine:
     def __init__(self, *, address: str | None = None, workers: int | None = None, device: str = "auto") -> None:
         if find_spec("ray") is None:
             raise InputError("the engine ray needs Ray: pip install 'warpjelly[cluster]'")
+        require_workers(workers)
         if device not in ("auto", "cpu", "cuda:0"):
             raise InputError(f"device {device}: on a cluster Ray chooses the GPU; give auto, cpu or cuda:0")
         self.address = address or os.environ.get(ADDRESS_VARIABLE) or HERE
