@@ -25,8 +25,8 @@ from .rayjobs import OTHER_TOKEN, Connected, Ended, Progress, Refused, Remark
 
 # How long a port may take to answer, and the cluster behind it, s.
 PORT_PATIENCE, CLUSTER_PATIENCE = 5.0, 30.0
-# How long a job may wait for a node that is large enough for it, s: nodes may be about to come.
-NODE_PATIENCE = 60.0
+# How long a job may wait for a node that is large enough for it, s: clouds take minutes to bring one.
+NODE_PATIENCE = 600.0
 # How often the engine looks whether it is to stop, s.
 INTERVAL = 0.1
 # How long the process that speaks with Ray may take to let go of the cluster, s.
