@@ -674,7 +674,10 @@ def test_the_live_display_shows_the_batch_and_every_worker(base):
         assert re.search(r"batch.*3/5 runs, [\d,]+ frames/s, \d:\d\d left", shown)
         assert "k[1]" in shown
         assert "4/10 frames" in shown
-        live.end("1", first, Result("k[1]", 3, "it diverged"))
+        # Another worker goes on with it.
+        live.advance("3", first, 4)
+        assert live.frames_done == 4 + 1
+        live.end("3", first, Result("k[1]", 3, "it diverged"))
         live.end("2", second, Result("k2", 0, None))
         progress.refresh()
         last = terminal.getvalue()[len(shown) :]

@@ -131,6 +131,8 @@ def test_names_are_made_from_values(tmp_path):
     ]
     assert names('[vary]\n"bodies.0.file" = ["../a/b.obj", "a b.obj"]') == ["file-.._a_b.obj", "file-a_b.obj"]
     assert names('[vary]\n"bodies.0.file" = ["a/b.obj", "a b.obj"]') == ["run_1", "run_2"]
+    assert names('[vary]\n"bodies.0.file" = ["a.obj", "A.obj"]') == ["run_1", "run_2"]
+    assert names(f'[vary]\n"{STIFFNESS}" = {{ range = [1, 10000], count = 10000 }}')[-1] == "stiffness-10000"
     assert names("[vary]\nx = [" + ", ".join(f"'{'x' * 99}{i:02}'" for i in range(12)) + "]")[-1] == "run_12"
 
 
@@ -171,6 +173,7 @@ def test_names_are_made_from_values(tmp_path):
         ('name = "/elsewhere/{x}"\n[vary]\nx = [1]', "cannot be called '/elsewhere/1'"),
         ('name = "a\\\\{x}"\n[vary]\nx = [1]', "its folder would not be in that of the batch"),
         ('name = "..{x}"\n[vary]\nx = [""]', "cannot be called '..'"),
+        ('name = "{x}"\n[vary]\nx = ["a."]', "names are of letters"),
         ('name = ".{x}"\n[vary]\nx = [1]', "names are of letters"),
         ('name = "b{x}"\n[vary]\nx = ["atch.json"]', "'batch.json': this name is reserved"),
         ('name = "Index.{x}"\n[vary]\nx = ["html"]', "this name is reserved"),
@@ -227,6 +230,9 @@ def test_folders_give_their_scenes_and_equal_names_get_their_folders(tmp_path):
     assert "bodies = 3: must be a list" in str(broken.problem)
     cubes = read_specs([tmp_path / "a" / "cube.toml", tmp_path / "b" / "cube.toml"])
     assert [entry.name for entry in cubes] == ["a_cube", "b_cube"]
+    (tmp_path / "b" / "cube.toml").write_text("name = 'CUBE'\n" + CUBE.read_text())
+    cubes = read_specs([tmp_path / "a" / "cube.toml", tmp_path / "b" / "cube.toml"])
+    assert [entry.name for entry in cubes] == ["a_cube", "b_CUBE"]
     with pytest.raises(InputError, match="two runs are called 'a_cube'"):
         read_specs([tmp_path / "a" / "cube.toml"] * 2)
     (tmp_path / "empty").mkdir()
@@ -243,6 +249,12 @@ def test_sweeps_and_scenes_can_be_made_in_python():
     entries = read_specs([sweep, {"whole": scene}])
     assert [entry.name for entry in entries] == ["dt-0.001", "dt-0.002", "whole"]
     assert entries[2].scene is scene
+    whole = {"bodies.cube.position": [0.0, 1.0, 0.0]}
+    sweep = Sweep(base=CUBE, vary={"bodies.cube.position.1": [2.0, 3.0]}, set=whole)
+    places = [entry.scene.bodies[0].position for entry in read_specs([sweep]) if entry.scene is not None]
+    assert [list(place) for place in places] == [[0.0, 2.0, 0.0], [0.0, 3.0, 0.0]]
+    # What a run changes of it stays with the run.
+    assert sweep.set == {"bodies.cube.position": [0.0, 1.0, 0.0]}
     with pytest.raises(InputError, match=r"cannot be called '\.\./x'"):
         read_specs([{"../x": scene}])
 
