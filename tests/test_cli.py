@@ -229,6 +229,17 @@ def test_an_interrupted_run_keeps_its_frames(warpjelly, tmp_path, monkeypatch):
     assert warpjelly("validate", tmp_path)[0] == 0
 
 
+def test_ctrl_c_is_told_wherever_it_comes(warpjelly, monkeypatch):
+    """Interrupt what is no run and no batch yet: one line, and 130."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warpjelly.scenefile.load_scene", interrupted)
+    for command in ("run", "check"):
+        assert warpjelly(command, CUBE) == (130, "", "error: interrupted\n")
+
+
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [

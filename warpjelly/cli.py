@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from .errors import InputError, SceneError, WarpjellyError, listed, verdict
+from .errors import INTERRUPTED, InputError, SceneError, WarpjellyError, listed, verdict
 
 if TYPE_CHECKING:
     from .expect import Outcome
@@ -702,7 +702,9 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
 def _guarded() -> int:
     """Run a command and return its exit code; whatever goes wrong becomes one line on stderr."""
     try:
-        return int(app(prog_name="warpjelly", standalone_mode=False) or 0)
+        code = int(app(prog_name="warpjelly", standalone_mode=False) or 0)
+        # Typer makes Ctrl-C a number.
+        return _fail("interrupted", code) if code == INTERRUPTED else code
     except typer.TyperException as error:
         # Without arguments the help was shown, and there is nothing to add.
         if not (message := error.format_message().rstrip(".")):

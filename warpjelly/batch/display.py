@@ -55,11 +55,12 @@ class Lines(Watcher):
 
     def advance(self, worker: str, job: Job, done: int) -> None:
         """Take in how far a run is."""
-        self._under_way[worker] = done
+        # By its name, as another worker may go on with it.
+        self._under_way[job.name] = done
 
     def end(self, worker: str, job: Job, result: Result) -> None:
         """Write what came of a run."""
-        done = self._under_way.pop(worker, 0)
+        done = self._under_way.pop(job.name, 0)
         if result.exit_code == 0:
             self._frames += job.scene.frame_count
         else:

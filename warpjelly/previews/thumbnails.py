@@ -34,7 +34,7 @@ class Strip:
     image: bytes
     """WebP: the hardest impact, and then the run at the times of all strips, each to the right of the last."""
     impact: float
-    """When that is, s."""
+    """When that is, s from its start."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Thumbnails:
 
     strips: dict[str, Strip]
     times: list[float]
-    """Of the pictures in each strip, but for the first, s; a run that is shorter shows its end."""
+    """Of the pictures in each strip, but for the first, s from the start; a run that is shorter shows its end."""
     ranges: list[ForceRange | None]
     """Forces at both ends of the colours of each group, N."""
     problems: dict[str, str]
@@ -73,7 +73,7 @@ def draw_thumbnails(
                 stage = open_stage(path)
                 seen += [corners_of(bounds)] if (bounds := motion_bounds(stage)) is not None else []
                 ranges += [forces] if (forces := force_range(stage)) is not None else []
-                ends.append(stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond())
+                ends.append((stage.GetEndTimeCode() - stage.GetStartTimeCode()) / stage.GetTimeCodesPerSecond())
         shared.append((np.concatenate(seen) if seen else None, widest(ranges) if ranges else None))
     total, done = sum(map(len, groups)), 0
     count = min(_TIMES, _MOST_IN_ALL // max(total, 1))
@@ -115,7 +115,8 @@ def _draw(
 
     rate, first, last = stage.GetTimeCodesPerSecond(), round(stage.GetStartTimeCode()), round(stage.GetEndTimeCode())
     impact = brightest_frame(stage, first, last)
-    frames = [impact, *(min(round(time * rate), last) for time in times)]
+    # Those over a shot start when that does.
+    frames = [impact, *(min(first + round(time * rate), last) for time in times)]
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         if points is not None:
             camera = UsdGeom.Camera.Get(stage, CAMERA)
@@ -129,4 +130,4 @@ def _draw(
         whole.paste(drawn[frame], (number * SIZE[0], 0))
     file = io.BytesIO()
     whole.save(file, "WEBP", quality=_QUALITY, method=_EFFORT)
-    return Strip(file.getvalue(), impact / rate)
+    return Strip(file.getvalue(), (impact - first) / rate)
