@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -123,6 +124,7 @@ def test_headers_sort(page) -> None:
     assert shown.get_attribute("#heads th:nth-child(5)", "aria-sort") == "ascending"
     cards = shown.eval_on_selector_all(".card b", "all => all.map(name => name.textContent)")
     assert cards[: len(ascending)] == ascending
+    assert shown.input_value("#chosen") == f"warpjelly compare {' '.join(ascending)} -o chosen.usda"
     button.press("Enter")
     assert names(shown) == ["broken", *ascending[::-1], "waiting"]
     button.press("Enter")
@@ -152,6 +154,8 @@ def test_filter_takes_words_and_conditions(page, text, expected) -> None:
     assert shown.inner_text("#shown") == f"{len(expected)} of 8 shown"
     finished = [name for name in expected if name.startswith("k")]
     assert shown.locator("#graph circle").count() == len(finished)
+    # There are no axes without values.
+    assert (shown.locator("#graph .grid").count() > 0) == bool(finished)
     command = f"warpjelly compare {' '.join(finished)} -o chosen.usda" if len(finished) > 1 else ""
     assert shown.input_value("#chosen") == command
     shown.fill("#filter", "")
@@ -294,6 +298,25 @@ def test_many_runs_have_fewer_pictures_each(drawn, monkeypatch) -> None:
     monkeypatch.setattr(thumbnails, "_MOST_IN_ALL", 1)
     found = draw_thumbnails([{"low": folder / "low"}])
     assert (found.times, len(pictures_of(found.strips["low"].image))) == ([], 1)
+
+
+@pytest.mark.egl
+def test_ctrl_c_ends_drawing_between_two_runs(drawn) -> None:
+    """Draw the run that is begun to its end: what is interrupted inside VTK can crash."""
+    folder, _ = drawn
+    done: list[int] = []
+
+    def interrupt(count: int, total: int) -> None:
+        done.append(count)
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            draw_thumbnails([{name: folder / name for name in ("low", "high")}], interrupt)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == [1]
 
 
 @pytest.mark.parametrize(
