@@ -37,7 +37,7 @@ from warpjelly.batch.jobs import Job, Result, Watcher
 from warpjelly.batch.perform import perform
 from warpjelly.batch.pool import LocalEngine
 from warpjelly.batch.sweep import Sweep
-from warpjelly.errors import EnvironmentFailedError, InputError, verdict
+from warpjelly.errors import INTERRUPTED, EnvironmentFailedError, InputError, verdict
 from warpjelly.machine import available_cores
 from warpjelly.scenefile import load_scene
 from warpjelly.stage.validate import stage_problems
@@ -685,6 +685,13 @@ def test_the_live_display_shows_the_batch_and_every_worker(base):
         assert "k2: finished" not in last
         assert re.search(r"5/5 runs \(1 failed\), [\d,]+ frames/s, 0:00 left", last)
         assert live.frames_done == 4 + 10
+        live.begin([first], done=0)
+        live.advance("1", first, 4)
+        live.end("1", first, Result("k[1]", INTERRUPTED, "interrupted after 4 of 10 frames"))
+        progress.refresh()
+        last = terminal.getvalue()
+        assert re.search(r"k\[1\] .* interrupted", last)
+        assert "(2 failed)" not in last
 
 
 def test_unforeseen_errors_are_told_and_logged(base, tmp_path, monkeypatch):

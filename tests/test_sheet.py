@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -127,6 +128,7 @@ def test_headers_sort(page) -> None:
     assert shown.get_attribute("#heads th:nth-child(5)", "aria-sort") == "ascending"
     cards = shown.eval_on_selector_all(".card b", "all => all.map(name => name.textContent)")
     assert cards[: len(ascending)] == ascending
+    assert shown.input_value("#chosen") == f"warpjelly compare {' '.join(ascending)} -o chosen.usda"
     button.press("Enter")
     assert names(shown) == ["broken", *ascending[::-1], "waiting"]
     button.press("Enter")
@@ -156,6 +158,8 @@ def test_filter_takes_words_and_conditions(page, text, expected) -> None:
     assert shown.inner_text("#shown") == f"{len(expected)} of 8 shown"
     finished = [name for name in expected if name.startswith("k")]
     assert shown.locator("#graph circle").count() == len(finished)
+    # There are no axes without values.
+    assert (shown.locator("#graph .grid").count() > 0) == bool(finished)
     command = f"warpjelly compare {' '.join(finished)} -o chosen.usda" if len(finished) > 1 else ""
     assert shown.input_value("#chosen") == command
     shown.fill("#filter", "")
@@ -319,6 +323,25 @@ def test_runs_over_a_shot_are_drawn_from_their_start_and_are_not_compared(drawn,
     stage = open_stage(folder / "comparison.usda")
     assert [prim.GetName() for prim in stage.GetPrimAtPath("/World/runs").GetChildren()] == ["low", "same"]
     assert f"not in {folder / 'comparison.usda'}: {folder / 'over/stage.usda'}: has no bodies below" in caplog.text
+
+
+@pytest.mark.egl
+def test_ctrl_c_ends_drawing_between_two_runs(drawn) -> None:
+    """Draw the run that is begun to its end: what is interrupted inside VTK can crash."""
+    folder, _ = drawn
+    done: list[int] = []
+
+    def interrupt(count: int, total: int) -> None:
+        done.append(count)
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            draw_thumbnails([{name: folder / name for name in ("low", "high")}], interrupt)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == [1]
 
 
 @pytest.mark.parametrize(

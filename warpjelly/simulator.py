@@ -156,9 +156,9 @@ class Simulator:
             broken = self.broken_limit() if self._limits is not None else None
             raise DivergedError(
                 f"the simulation diverged before t = {self.time:.4g} s: particle {particle - body.particles.start} of "
-                f"'{body.name}' is beyond {diagnostics.MAX_DISTANCE:g} m or {diagnostics.MAX_SPEED:g} m/s; "
-                f"{f'{broken}; ' if broken else ''}lower solver.dt (now {self.dt:.3g} s), or stiffness and damping of "
-                "its material or of a collider"
+                f"'{body.name}' is beyond {diagnostics.MAX_DISTANCE:.0e} m or {diagnostics.MAX_SPEED:.0e} m/s; "
+                f"{broken or f'lower solver.dt (now {self.dt:.3g} s)'}, or stiffness and damping of its material or "
+                "of a collider"
             )
 
     def first_lost(self) -> int | None:

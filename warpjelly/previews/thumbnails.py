@@ -12,6 +12,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ..errors import verdict
+from ..signals import interruptions
 from ..stage.common import ForceRange, color_by, corners_of, force_range, motion_bounds, widest
 from ..stage.prims import CAMERA
 from ..stage.stagefiles import open_stage
@@ -63,6 +64,7 @@ def draw_thumbnails(
     Raises:
         InputError: pyvista or Pillow is not installed.
         EnvironmentFailedError: there is no offscreen OpenGL.
+        KeyboardInterrupt: after the run that was drawn when Ctrl-C was pressed.
     """
     problems: dict[str, str] = {}
     shared, ends = [], [0.0]
@@ -79,7 +81,8 @@ def draw_thumbnails(
     count = min(_TIMES, _MOST_IN_ALL // max(total, 1))
     times = np.linspace(0.0, max(ends), count).tolist() if count > 1 else []
     strips: dict[str, Strip] = {}
-    with View(SIZE) as window:
+    # An exception at any moment, as while VTK is loading, can crash it.
+    with interruptions() as interrupted, View(SIZE) as window:
         for group, (points, forces) in zip(groups, shared, strict=True):
             for name, path in group.items():
                 if name not in problems:
@@ -87,6 +90,8 @@ def draw_thumbnails(
                         strips[name] = _draw(window, open_stage(path), times, points, forces)
                 done += 1
                 progress(done, total)
+                if interrupted():
+                    raise KeyboardInterrupt
     return Thumbnails(strips, times, [forces for _, forces in shared], problems)
 
 
