@@ -6,6 +6,7 @@ import gc
 import itertools
 import multiprocessing
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -212,6 +213,66 @@ def test_an_interruption_leaves_whole_blocks(small_parts: None, monkeypatch: pyt
             simulator.step(simulator.substeps)
     expected.step(simulator.substeps)
     assert simulator.state.x.numpy().tobytes() == expected.state.x.numpy().tobytes()
+    assert simulator.time == expected.time > 0.0
+
+
+def test_who_is_left_at_work_is_waited_for(small_parts: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupt the wait for a helper that has not looked at its launches yet, and step on: it finds nothing to do."""
+    simulator, expected = (Simulator(make_crowd(), device="cpu", threads=threads) for threads in (2, 1))
+    assert simulator._stepper._team is not None
+    simulator.step(1)
+    simulator.prepare()
+    launch, main = team.wp.capture_launch, threading.current_thread()
+    held, release = threading.Event(), threading.Event()
+
+    def late(graph: Any) -> None:
+        if threading.current_thread() is main:
+            held.wait()
+        else:
+            held.set()
+            release.wait()
+        launch(graph)
+
+    def interrupted(helpers: Any) -> None:
+        if helpers and not release.is_set():
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(team.wp, "capture_launch", late)
+        patch.setattr(team, "wait", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            simulator.step(simulator.substeps)
+    timer = threading.Timer(0.1, release.set)
+    timer.start()
+    simulator.step(1)
+    timer.join()
+    # Whatever it still does would be seen.
+    simulator._stepper._team._helpers.shutdown()
+    expected.step(simulator.substeps + 2)
+    assert bits_of(simulator) == bits_of(expected)
+    assert simulator.time == expected.time
+
+
+def test_what_goes_wrong_in_a_helper_is_raised(small_parts: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise the error of one helper, but not before the other one has ended."""
+    simulator = Simulator(make_crowd(soft=False), device="cpu", threads=3)
+    simulator.step(1)
+    launch, main, begun, ended = team.wp.capture_launch, threading.current_thread(), threading.Barrier(3), []
+
+    def broken(graph: Any) -> None:
+        begun.wait()
+        if threading.current_thread() is not main:
+            if not ended:
+                ended.append("first")
+                raise RuntimeError("broken")
+            time.sleep(0.05)
+            ended.append("second")
+        launch(graph)
+
+    monkeypatch.setattr(team.wp, "capture_launch", broken)
+    with pytest.raises(RuntimeError, match="broken"):
+        simulator.step(1)
+    assert ended == ["first", "second"]
 
 
 def test_simulators_share_a_process(small_parts: None) -> None:
