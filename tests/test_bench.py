@@ -1,6 +1,7 @@
 import dataclasses
 import json
 import math
+import os
 import sys
 import time
 from importlib import util
@@ -27,8 +28,8 @@ REPORT_KEYS = {
 
 
 def write_baseline(path: Path, ratio: float, device: str = "cpu") -> Path:
-    """Write a baseline in which each scene has some ratio to the reference kernel."""
-    scenes = {name: {"reference_ratio": ratio} for name in bench.SCENES}
+    """Write a baseline of 4 cores in which each scene used 2 and has some ratio to the reference kernel."""
+    scenes = {name: {"reference_ratio": ratio, "cores_used": 2.0} for name in bench.SCENES}
     path.write_text(json.dumps({"device": device, "device_name": "a processor", "cores": 4, "scenes": scenes}))
     return path
 
@@ -118,14 +119,18 @@ def test_memory_counts_each_array_once():
     assert bench.held_bytes(masses) == 27 * 4
 
 
-@pytest.mark.parametrize(("now", "slower"), [(7.4, True), (7.6, False), (10.0, False), (30.0, False)])
-def test_regressions_go_by_the_ratio_to_the_reference_kernel(tmp_path, now, slower):
-    """Warn of a scene that lost more than a quarter, and name both ratios and the machine of the baseline."""
+@pytest.mark.parametrize(
+    ("now", "cores", "slower"),
+    [(7.4, 4, "10.00"), (7.6, 4, ""), (30.0, 4, ""), (7.4, 2, "10.00"), (3.8, 1, ""), (3.7, 1, "5.00")],
+)
+def test_regressions_go_by_the_ratio_to_the_reference_kernel(tmp_path, now, cores, slower):
+    """Warn of a scene that lost more than a quarter of what it may have here, and name the machine of the baseline."""
     baseline = bench.read_baseline(write_baseline(tmp_path / "then.json", 10.0))
-    lines = bench.regressions({"cube_8": figures_of(now), "new": figures_of(0.1)}, baseline)
-    assert len(lines) == slower
+    lines = bench.regressions({"cube_8": figures_of(now), "new": figures_of(0.1)}, baseline, cores=cores)
+    assert len(lines) == bool(slower)
     for line in lines:
-        assert all(part in line for part in ("cube_8", f"{now:.2f}", "10.00", "a processor", "4 cores", "25%"))
+        words = ("cube_8", f"{now:.2f}", slower, f"with {cores} cores", "a processor with 4 cores", "25%")
+        assert all(part in line for part in words)
 
 
 def test_command_prints_one_json_object_and_warns(warpjelly, tmp_path):  # noqa: F811
@@ -143,7 +148,8 @@ def test_command_prints_one_json_object_and_warns(warpjelly, tmp_path):  # noqa:
     # What was written is a baseline: the same figures are no slower than themselves.
     ratios = bench.read_baseline(report)["reference_ratio"]
     assert ratios == {"cube_8": printed["scenes"]["cube_8"]["reference_ratio"]}
-    assert bench.regressions({"cube_8": figures_of(ratios["cube_8"])}, bench.read_baseline(report)) == []
+    own = bench.read_baseline(report)
+    assert bench.regressions({"cube_8": figures_of(ratios["cube_8"])}, own, cores=printed["cores"]) == []
 
 
 def test_command_prints_a_table(warpjelly, tmp_path):  # noqa: F811
@@ -153,6 +159,19 @@ def test_command_prints_a_table(warpjelly, tmp_path):  # noqa: F811
     assert (code, err) == (0, "")
     for words in ("6,220", "million springs/s", "share of springs", "bytes per particle", "not compared"):
         assert words in out
+
+
+def vanish(*_):
+    """End the process that measures."""
+    os._exit(1)
+
+
+def test_a_process_that_is_lost_is_named(warpjelly, monkeypatch):  # noqa: F811
+    """Say which scene was measured, with the exit code of an environment that failed."""
+    monkeypatch.setattr(bench, "measure", vanish)
+    code, out, err = warpjelly("bench", "cube_8", "--rounds", 1)
+    assert (code, out) == (4, "")
+    assert "cube_8: its process was killed; is there too little memory?" in one_line(err)
 
 
 def test_own_baseline_has_every_scene():
