@@ -4,7 +4,7 @@ import math
 import os
 import sys
 import time
-from importlib import util
+from importlib import import_module, util
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -281,9 +281,35 @@ def test_missing_peers_are_named(monkeypatch, capsys):
     assert raced == [kind for kind in contenders.CONTENDERS if kind is not contenders.Taichi]
 
 
-def test_unknown_object_is_refused(monkeypatch, capsys):
-    """Name the objects that there are."""
-    monkeypatch.setattr(sys, "argv", ["peers.py", "cube_9"])
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("peers", ["cube_9"], "cube_9: there is cube_8, cube_32"),
+        ("peers", ["--rounds", "0"], "--rounds 0: at least 1"),
+        ("peers", ["-o", "README.md"], "README.md: there already"),
+        ("peers", ["-o", "no/where.json"], "where.json: its folder does not exist"),
+        ("scale", ["stress_block_1m", "block"], "block: no scene under scenes/"),
+        ("batch", ["0"], "RUNS 0: at least 1"),
+        ("building", ["16"], "LARGEST 16: at least 32"),
+        ("building", ["large"], "invalid int value: 'large'"),
+        ("stage", ["3"], "POINTS 3, FRAMES 200: at least 4 and 8"),
+        ("contacts", ["8"], "unrecognized arguments: 8"),
+    ],
+)
+def test_benchmarks_refuse_what_they_cannot_do(name, arguments, message, monkeypatch, capsys):
+    """Say what is wrong before anything is measured."""
+    monkeypatch.chdir(Path(__file__).parents[1])
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
     with pytest.raises(SystemExit, match="2"):
-        peers.main()
-    assert "cube_9" in capsys.readouterr().err
+        import_module(name).main()
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert message in err
+
+
+def test_a_large_scene_that_fails_is_named(monkeypatch):
+    """Name the scene whose run said what is wrong with it."""
+    scale = import_module("scale")
+    monkeypatch.setattr(scale.sys, "executable", "false")
+    with pytest.raises(SystemExit, match=r"^jello_cube: `warpjelly run` ended with exit code 1$"):
+        scale.measure("jello_cube")
