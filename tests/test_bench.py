@@ -57,6 +57,22 @@ def test_figures_are_finite_and_consistent():
     assert figures.first_frame_seconds > 0.0
 
 
+def test_figures_are_the_ratios_that_they_are_called(monkeypatch):
+    """Put each variant above or below the line where it belongs, given how long each takes."""
+    seconds = {"free": 2.0, "reference": 30.0, "rk4": 9.0, "dust": 0.5, "ground": 2.5, "standing": 2.0,
+               "touching": 4.0, "beside": 3.0, "singles": 3.0}  # fmt: skip
+    slices = {name: bench.Slice(each, 2.0 if name == "free" else 1.0) for name, each in seconds.items()}
+    monkeypatch.setattr(bench, "time_in_turn", lambda variants, **_: {name: [slices[name]] * 2 for name in variants})
+    figures = bench.measure(bench.Cubes(2, count=2), "cpu", 2, time.time() - 100.0)
+    assert (figures.seconds_per_substep, figures.substeps_per_second, figures.cores_used) == (2.0, 0.5, 2.0)
+    assert figures.springs_per_second == figures.springs / 2.0
+    assert (figures.reference_ratio, figures.rk4_ratio) == (15.0, 4.5)
+    assert (figures.integration_share, figures.pair_share) == (0.25, 0.25)
+    assert figures.contact_share == pytest.approx(0.2)
+    assert (figures.at_once_ratio, figures.at_once_core_ratio) == (1.5, 0.75)
+    assert figures.first_frame_seconds >= 100.0
+
+
 def test_one_body_has_no_neighbours():
     """Leave out what needs several bodies."""
     figures = bench.measure(bench.Cubes(2), "cpu", 1, time.time())
