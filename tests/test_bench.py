@@ -63,6 +63,8 @@ def test_figures_are_the_ratios_that_they_are_called(monkeypatch):
                "touching": 4.0, "beside": 3.0, "singles": 3.0}  # fmt: skip
     slices = {name: bench.Slice(each, 2.0 if name == "free" else 1.0) for name, each in seconds.items()}
     monkeypatch.setattr(bench, "time_in_turn", lambda variants, **_: {name: [slices[name]] * 2 for name in variants})
+    runs = {1: bench.Slice(3.0, 2.0), 2: bench.Slice(12.0, 1.0)}
+    monkeypatch.setattr(bench, "time_runs", lambda scenes, **_: runs[len(scenes)])
     figures = bench.measure(bench.Cubes(2, count=2), "cpu", 2, time.time() - 100.0)
     assert (figures.seconds_per_substep, figures.substeps_per_second, figures.cores_used) == (2.0, 0.5, 2.0)
     assert figures.springs_per_second == figures.springs / 2.0
@@ -70,13 +72,14 @@ def test_figures_are_the_ratios_that_they_are_called(monkeypatch):
     assert (figures.integration_share, figures.pair_share) == (0.25, 0.25)
     assert figures.contact_share == pytest.approx(0.2)
     assert (figures.at_once_ratio, figures.at_once_core_ratio) == (1.5, 0.75)
+    assert (figures.runs_at_once_ratio, figures.runs_at_once_core_ratio) == (4.0, 2.0)
     assert figures.first_frame_seconds >= 100.0
 
 
 def test_one_body_has_no_neighbours():
     """Leave out what needs several bodies."""
     figures = bench.measure(bench.Cubes(2), "cpu", 1, time.time())
-    assert (figures.pair_share, figures.at_once_ratio, figures.at_once_core_ratio) == (None, None, None)
+    assert (figures.pair_share, figures.at_once_ratio, figures.runs_at_once_ratio) == (None, None, None)
 
 
 def test_bodies_touch_what_they_are_measured_with():
