@@ -586,8 +586,8 @@ def bench(
     Figures are medians over rounds in which everything has its turn; other work on the machine widens their range.
 
     The reference kernel is the plainest that computes the forces of springs, one after another on the CPU. Measured in
-    the same rounds, it tells a slower program from a slower machine: a scene whose ratio to it is a quarter below the
-    baseline's is warned of, and the exit code stays 0.
+    the same rounds, it tells a slower program from a slower machine: a scene whose ratio to it is a quarter below what
+    the baseline promises for as many cores is warned of, and the exit code stays 0.
 
     To see what a change does to speed here: bench -o before.json, change, bench --baseline before.json.
     """

@@ -139,8 +139,13 @@ class Simulator:
         if count < 0:
             raise ValueError(f"cannot step back by {-count} substeps")
         frames, rest = divmod(count, self.substeps)
-        for substeps in self._frame_blocks() * frames + [1] * rest:
-            self._stepper.step(substeps)
+        try:
+            for substeps in self._frame_blocks() * frames + [1] * rest:
+                self._stepper.step(substeps)
+        except KeyboardInterrupt:
+            # Some blocks were done.
+            self.substep_count = int(self.state.step.numpy()[0])
+            raise
         self.substep_count += count
 
     def advance_frame(self) -> None:
