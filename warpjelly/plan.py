@@ -61,6 +61,9 @@ steps = logging.getLogger("warpjelly.steps")
 YOUNG_SPANS = 2
 # Springs across the boundary of two materials end spans, too: so many times the spans where a body has several.
 MIXED_SPANS = 1.5
+# Keys of a body that say where it is and what happens to it, not what it is made of.
+PLACEMENT = {"name", "position", "rotation", "velocity", "angular_velocity", "charge", "pinned", "positions"}
+PLACEMENT |= {"velocities"}
 # Resolutions to try where a model has no voxel; the last ones take a second.
 _FINER = [2**k for k in range(2, 11)]
 # A clip of the stage has at most so many frames, and bytes. It is what memory holds, and what a sudden end of the
@@ -79,7 +82,7 @@ class BodyPlan:
     materials: dict[str, int]
     """Number of jelly cubes of each of its materials, by name, in the order of the lattice."""
     build: Callable[[], Lattice]
-    """Makes its particles, springs and surface."""
+    """Makes its particles, springs and surface; the same function for bodies that are made alike."""
     particle_count: int
     spring_bound: int
     """No more springs than this."""
@@ -151,7 +154,7 @@ def clip_length(point_count: int) -> int:
 
 
 def plan_scene(scene: Scene, known: Plan | None = None) -> Plan:
-    """Find out how every body is made and count what follows from it.
+    """Find out how every body is made and count what follows from it; once for all that are made alike.
 
     Args:
         scene: what to plan.
@@ -161,7 +164,14 @@ def plan_scene(scene: Scene, known: Plan | None = None) -> Plan:
         SceneError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
     shot = _open_shot(scene)
-    plan = Plan(scene, [_known_body(body, scene, known) or _plan_body(body, scene, shot) for body in scene.bodies])
+    plans = {} if known is None else {_making(plan.body, known.scene): plan for plan in known.bodies}
+    bodies = []
+    for body in scene.bodies:
+        making = _making(body, scene)
+        if making not in plans:
+            plans[making] = _plan_body(body, scene, shot)
+        bodies.append(_planned_as(plans[making], body))
+    plan = Plan(scene, bodies)
     if shot is not None:
         _require_meshes(shot, plan)
     most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]
@@ -175,9 +185,14 @@ def plan_scene(scene: Scene, known: Plan | None = None) -> Plan:
     return plan
 
 
-# What a body is made of does not depend on these.
-_PLACING = {"name", "position", "rotation", "velocity", "angular_velocity", "charge", "pinned"}
-_PLACING |= {"positions", "velocities"}
+def _making(body: AnyBody, scene: Scene) -> str:
+    """Return what the plan of a body depends on but for the names of its materials, as text."""
+    names = _material_names(body)
+    # Which of them are the same says which cells are alike, and the law what has to be known of cells.
+    alike = [(names.index(name), scene.materials[name].law) for name in names]
+    excluded = dict.fromkeys({*PLACEMENT, "material"}, True) | {"regions": {"__all__": {"material"}}}
+    shown = scene.output.surface, sorted(scene.output.show)
+    return f"{body.model_dump_json(exclude=excluded)} {alike} {scene.up_axis} {shown}"
 
 
 def _material_names(body: AnyBody) -> list[str]:
@@ -186,26 +201,10 @@ def _material_names(body: AnyBody) -> list[str]:
     return [body.material, *(region.material for region in regions)]
 
 
-def _known_body(body: AnyBody, scene: Scene, known: Plan | None) -> BodyPlan | None:
-    """Return the plan of a body from that of another scene, if one there is made alike."""
-    if known is None or scene.output.over is not None or known.scene.output.over is not None:
-        return None
-
-    def making(body: AnyBody, scene: Scene) -> tuple[Any, ...]:
-        names = _material_names(body)
-        # Which of them are the same says which cells are alike, and the law what has to be known of cells.
-        alike = [(names.index(name), scene.materials[name].law) for name in names]
-        regions = body.regions if isinstance(body, VoxelsBody | ModelBody) else []
-        made = body.model_dump(exclude={*_PLACING, "material", "regions"})
-        selected = [region.model_dump(exclude={"material"}) for region in regions]
-        return made, selected, alike, scene.up_axis, scene.output.surface, set(scene.output.show)
-
-    wanted = making(body, scene)
-    for plan in known.bodies:
-        if making(plan.body, known.scene) == wanted:
-            renamed = dict(zip(_material_names(plan.body), _material_names(body), strict=True))
-            return replace(plan, body=body, materials={renamed[name]: count for name, count in plan.materials.items()})
-    return None
+def _planned_as(plan: BodyPlan, body: AnyBody) -> BodyPlan:
+    """Return the plan of a body that is made like another one, with its own place and names of materials."""
+    names = dict(zip(_material_names(plan.body), _material_names(body), strict=True))
+    return replace(plan, body=body, materials={names[name]: count for name, count in plan.materials.items()})
 
 
 def _open_shot(scene: Scene) -> Shot | None:
