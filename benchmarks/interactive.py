@@ -20,7 +20,7 @@ from warpjelly.gui.session import Session
 from warpjelly.gui.snapshot import Snapshot
 from warpjelly.scene import Scene
 
-SIZES = (8, 10, 16, 20, 24, 28, 32, 47)
+SIZES = (8, 10, 16, 24, 32, 36, 40, 47)
 # Of the springs, N/m.
 STIFFNESS = 900.0
 # Simulated over real time that is out of reach.
