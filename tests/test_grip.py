@@ -254,6 +254,23 @@ def test_threads_pull_alike() -> None:
     np.testing.assert_array_equal(results[0], results[1])
 
 
+def test_a_step_with_everything_in_it_is_captured() -> None:
+    """Have room for the launches of all effects, of two threads, in one graph."""
+    cube = {"type": "cube", "material": "jelly", "particles_per_edge": 14}
+    scene = make_scene(
+        bodies=[{**cube, "name": "a"}, {**cube, "name": "b", "position": [0.0, 1.2, 0.0]}],
+        colliders=[{"type": "half_space", "center": [0.0, -0.6, 0.0], "normal": [0.0, 1.0, 0.0]}],
+        fields=[{"type": "constant", "force": [0.1, 0.0, 0.0]}],
+        soft_contact={},
+        solver={"integrator": "rk4"},
+        fps=10.0,
+    )
+    simulator = interactive(scene, threads=2)
+    simulator.step(64)
+    assert simulator.threads == 2
+    assert simulator._stepper.capturable
+
+
 def test_a_hand_holds_what_is_near_and_no_more_than_it_can() -> None:
     """Take a sixteenth of the particles, those nearest to the point, the nearest ones firmly."""
     body = {"name": "cube", "type": "cube", "material": "jelly", "particles_per_edge": 18}

@@ -16,7 +16,7 @@ from pxr import Usd
 from runs import samples_of
 from worlds import make_material, make_scene
 
-from warpjelly.errors import InputError
+from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.gui import session as sessions
 from warpjelly.gui.pace import MOST_BEHIND, WINDOW, Pace
 from warpjelly.gui.session import Session
@@ -25,6 +25,7 @@ from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
 from warpjelly.simulator import Simulator
 from warpjelly.stage.stagefiles import open_stage, progress
+from warpjelly.stage.stagewriter import StageWriter
 from warpjelly.stage.validate import stage_problems
 
 SCENES = Path(__file__).parents[1] / "scenes"
@@ -800,6 +801,36 @@ def test_closing_finishes_a_recording(tmp_path: Path) -> None:
         session.step(40)
     assert json.loads((tmp_path / "run" / "run.json").read_text())["frames"] == 5
     assert stage_problems(tmp_path / "run") == []
+
+
+def test_a_recording_that_cannot_be_written_ends(
+    start: Callable[..., Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Say why, keep what was written, and let the simulation go on."""
+    session = start()
+    session.record(tmp_path / "run")
+
+    def refuse(*_: object) -> None:
+        raise EnvironmentFailedError("run: cannot write the stage: No space left on device")
+
+    session.step(30)
+    settled(session)
+    monkeypatch.setattr(StageWriter, "write_frame", refuse)
+    # A sample that cannot be written is noticed with one of the next.
+    for _ in range(3):
+        session.step(10)
+        session._live.recording and session._live.recording._background._executor.submit(int).result()
+    with pytest.raises(EnvironmentFailedError, match="No space left on device"):
+        settled(session)
+    shown = settled(session)
+    assert shown.recording is None
+    assert shown.messages[-1].text.endswith("No space left on device")
+    before = shown.time
+    session.step(10)
+    assert settled(session).time > before
+    assert (tmp_path / "run" / "stage.usda").exists()
+    with pytest.raises(InputError, match="no recording is going"):
+        session.stop_recording()
 
 
 KILLED = """

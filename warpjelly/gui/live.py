@@ -154,7 +154,8 @@ class Live:
         """Move the hand to a point [3], m, if it holds anything."""
         if self._grip.hold is not None:
             self._grip.move(point)
-            self._changed = True
+            # While it plays the next snapshot shows it soon enough, however often the hand moves.
+            self._changed |= not self.playing
 
     def release(self) -> None:
         """Let go."""

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
 from ..background import Background
 from ..checkpoint import origin_of, scene_keys
-from ..errors import EnvironmentFailedError, InputError
+from ..errors import EnvironmentFailedError, InputError, WarpjellyError
 from ..files import locked
 from ..run import metrics_row, provenance
 from ..rundir import Recorder, open_metrics, refuse_to_replace_run, remove_leftovers, write_record
@@ -115,7 +115,9 @@ class Recording:
 
     def finish(self, sim: Simulator, *, diverged: bool) -> None:
         """Take no more samples, and bring the stage into its final form; ``wait`` says when that is done."""
-        self._background.submit(self._finish, sim, diverged)
+        # What could not be written before, wait() says.
+        with suppress(WarpjellyError):
+            self._background.submit(self._finish, sim, diverged)
 
     def wait(self) -> dict[str, Any]:
         """Wait until all is written, and return the record of the run.
