@@ -91,6 +91,7 @@ def add_spring_forces(
     real power[{MAX_SPAN}];
     for (int k = 0; k < 8; ++k) power[((count - 1) & ~7) + k] = real(0);
     auto law = [&](int s, real& gx, real& gy, real& gz) {{
+        #pragma clang fp contract(fast)
         real dx = px[s + d] - px[s], dy = py[s + d] - py[s], dz = pz[s + d] - pz[s];
         real du = pu[s + d] - pu[s], dv = pv[s + d] - pv[s], dw = pw[s + d] - pw[s];
         real square = dx * dx + dy * dy + dz * dz;
