@@ -88,8 +88,7 @@ def add_spring_forces(
     const real *pu = row(v, 0) + i, *pv = row(v, 1) + i, *pw = row(v, 2) + i;
     real *fx = row(f, 0) + i, *fy = row(f, 1) + i, *fz = row(f, 2) + i;
     const int d = j - i;
-    real power[{MAX_SPAN}];
-    for (int k = 0; k < 8; ++k) power[((count - 1) & ~7) + k] = real(0);
+    real total = real(0);
     auto law = [&](int s, real& gx, real& gy, real& gz) {{
         #pragma clang fp contract(fast)
         real dx = px[s + d] - px[s], dy = py[s + d] - py[s], dz = pz[s + d] - pz[s];
@@ -110,7 +109,12 @@ def add_spring_forces(
         fx[s] += gx;
         fy[s] += gy;
         fz[s] += gz;
-        power[s] = damping * approach * approach;
+        real power = damping * approach * approach;
+        {{
+            // A sum for each lane: a single one would wait for each addition in turn.
+            #pragma clang fp reassociate(on)
+            total += power;
+        }}
     }};
     if (d >= count || -d >= count) {{
         each(0, count, [&](int s) {{
@@ -125,10 +129,6 @@ def add_spring_forces(
         each(0, count, [&](int s) {{ law(s, gx[s], gy[s], gz[s]); }});
         each(0, count, [&](int s) {{ fx[s + d] -= gx[s]; fy[s + d] -= gy[s]; fz[s + d] -= gz[s]; }});
     }}
-    // Eight sums at once: a single one would wait for each addition in turn.
-    real sums[8] = {{}};
-    for (int s = 0; s < count; s += 8) for (int k = 0; k < 8; ++k) sums[k] += power[s + k];
-    real total = ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]));
     losses.data[span] += double(loss_weight * total);
 """)
 def _add_span(
