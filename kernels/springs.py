@@ -43,6 +43,18 @@ def spring_energy(offset: Any, rest: Any, stiffness: Any):
     return type(rest)(0.5) * stiffness * stretch * stretch
 
 
+# The lanes of a warp of a GPU, which all belong to one span, add up first: two atomic adds a span, not one a spring.
+@wp.func_native("""
+    #ifdef __CUDA_ARCH__
+    for (int lanes = 16; lanes > 0; lanes /= 2) loss += __shfl_xor_sync(0xffffffff, loss, lanes);
+    if (lane % 32 == 0) atomicAdd(&losses.data[span], double(loss));
+    #else
+    if (loss != 0) losses.data[span] += double(loss);
+    #endif
+""")
+def _add_loss(losses: wp.array(dtype=wp.float64), span: int, lane: int, loss: Any): ...
+
+
 @wp.kernel
 def add_spring_forces(
     # Model:
@@ -57,23 +69,24 @@ def add_spring_forces(
     f: wp.array2d(dtype=Any),
     losses: wp.array(dtype=wp.float64),
 ):
-    """Add the forces of the springs, one thread per spring; launched over (span, lane).
+    """Add the forces of the springs, one thread per spring; launched over (span, MAX_SPAN lanes).
 
     Losses [span_count] gain the power of the dampers times loss_weight.
     """
     index, lane = wp.tid()
     span = spans[index]
-    if lane >= span[2]:
-        return
-    i = span[0] + lane
-    j = span[1] + lane
-    c = classes[span[3]]
-    offset = vectors.load(x, j) - vectors.load(x, i)
-    velocity = vectors.load(v, j) - vectors.load(v, i)
-    force = spring_force(offset, velocity, c[0], c[1], c[2])
-    vectors.add(f, i, force)
-    vectors.add(f, j, -force)
-    wp.atomic_add(losses, index, wp.float64(loss_weight * damping_power(offset, velocity, c[2])))
+    loss = type(loss_weight)(0.0)
+    if lane < span[2]:
+        i = span[0] + lane
+        j = span[1] + lane
+        c = classes[span[3]]
+        offset = vectors.load(x, j) - vectors.load(x, i)
+        velocity = vectors.load(v, j) - vectors.load(v, i)
+        force = spring_force(offset, velocity, c[0], c[1], c[2])
+        vectors.add(f, i, force)
+        vectors.add(f, j, -force)
+        loss = loss_weight * damping_power(offset, velocity, c[2])
+    _add_loss(losses, index, lane, loss)
 
 
 # The same law for a whole span on the CPU, in vector instructions. Where its two ends overlap, the forces on the second
