@@ -203,8 +203,8 @@ def print_targets(results: dict[str, dict[str, Any]], report: dict[str, Any]) ->
             rows.append([f"{name}, times as fast as {kind.label}", measured, f"at least {target:g}"])
     scenes = report["scenes"]
     if (scene := scenes.get("cubes_100")) is not None:
-        label = "100 cubes at once, times as fast as one after another, per core used"
-        rows.append([label, f"{scene['at_once_core_ratio']:.2f}", "at least 1.7"])
+        label = "100 cubes at once, times as fast as runs one after another, per core used"
+        rows.append([label, f"{scene['runs_at_once_core_ratio']:.2f}", "at least 1.7"])
     if (scene := scenes.get("cube_64")) is not None:
         rows.append(["cube_64, a step of RK4, in steps", f"{scene['rk4_ratio']:.2f}", "at most 4.3"])
         rows.append(

@@ -10,7 +10,7 @@ from typing import Any
 
 import warp as wp
 
-from . import bounds, vectors
+from . import bounds, turns, vectors
 
 wp.set_module_options({"enable_backward": False})
 
@@ -18,6 +18,8 @@ wp.set_module_options({"enable_backward": False})
 SEARCH_MARGIN = 1e-5
 # Nearer than the sum of radii at rest is nearer by more than this share, far above the rounding of places at rest.
 REST_MARGIN = 1e-3
+# Members of the skin that a thread of a CPU deals with at a time, and a block of a GPU at once.
+GROUP = 256
 
 
 def _skin_struct(real: type) -> Any:
@@ -163,6 +165,10 @@ def may_collide(skin: Any, reach: Any, a: int, b: int):
 
 @wp.kernel
 def add_pair_forces(
+    # Threads:
+    turn: turns.Turn,
+    # How many lanes share a group:
+    lanes: int,
     # Model:
     skin: Any,
     mass: wp.array(dtype=Any),
@@ -170,6 +176,7 @@ def add_pair_forces(
     # State in:
     near_lower: wp.array2d(dtype=Any),
     near_upper: wp.array2d(dtype=Any),
+    found: wp.array(dtype=wp.int32),
     grid: wp.uint64,
     points: wp.array(dtype=Any),
     v: wp.array2d(dtype=Any),
@@ -182,51 +189,60 @@ def add_pair_forces(
     f: wp.array2d(dtype=Any),
     losses: wp.array2d(dtype=wp.float64),
 ):
-    """Add the forces on each particle of the skin, one thread each.
+    """Add the forces on each particle of the skin; launched over (group of GROUP of them, lane).
 
-    With culling, only particles near what their chunk may touch look for others. Losses [2, skin_count] gain what
-    damping and friction take from each particle, at the velocity that the forces so far make some time ahead, times
-    loss_weight; only the sum over both particles of a pair is the same for who moves along.
+    With culling, only particles near what their chunk may touch look for others, and none where nobody was found near
+    anybody. Losses [2, skin_count] gain what damping and friction take from each particle, at the velocity that the
+    forces so far make some time ahead, times loss_weight; only the sum over both particles of a pair is the same for
+    who moves along.
     """
-    a = wp.tid()
-    point = points[a]
-    chunk = skin.chunk[a]
-    search = search_radius(skin, skin.radius[a])
-    near_low = vectors.load(near_lower, chunk)
-    near_high = vectors.load(near_upper, chunk)
-    if culling and not bounds.are_near(point, point, near_low, near_high, search):
-        return
-    i = skin.particles[a]
-    total = type(dt)(0.0) * point
-    damping = type(dt)(0.0) * point
-    rubbing = type(dt)(0.0) * point
-    touches = bool(False)
-    query = wp.hash_grid_query(grid, point, search)
-    b = wp.int32(0)
-    while wp.hash_grid_query_next(query, b):
-        if b != a:
-            offset = point - points[b]
-            reach = skin.radius[a] + skin.radius[b]
-            if wp.length(offset) < reach and may_collide(skin, reach, a, b):
-                touches = True
-                j = skin.particles[b]
-                velocity = vectors.load(v, i) - vectors.load(v, j)
-                reduced = mass[i] * mass[j] / (mass[i] + mass[j])
-                force, overlap = pair_force(
-                    offset, velocity, reach, skin.stiffness, skin.damping, skin.friction, reduced, dt
-                )
-                total += force
-                normal = wp.normalize(offset)
-                push = wp.dot(force, normal)
-                damping += (push - skin.stiffness * overlap) * normal
-                rubbing += force - push * normal
-    # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
-    if touches:
-        so_far = vectors.load(f, i) + total
-        vectors.store(f, i, so_far)
-        velocity = vectors.load(v, i) + ahead * inv_mass[i] * so_far
-        losses[0, a] -= wp.float64(loss_weight) * wp.float64(wp.dot(damping, velocity))
-        losses[1, a] -= wp.float64(loss_weight) * wp.float64(wp.dot(rubbing, velocity))
+    group, lane = wp.tid()
+    task = group * lanes + lane
+    mine = turns.take(turn, task)
+    begin = group * GROUP
+    end = wp.min(begin + GROUP, points.shape[0])
+    if not mine or (culling and found[0] == 0):
+        end = begin
+    for a in range(begin + lane, end, lanes):
+        point = points[a]
+        chunk = skin.chunk[a]
+        search = search_radius(skin, skin.radius[a])
+        near_low = vectors.load(near_lower, chunk)
+        near_high = vectors.load(near_upper, chunk)
+        if culling and not bounds.are_near(point, point, near_low, near_high, search):
+            continue
+        i = skin.particles[a]
+        total = type(dt)(0.0) * point
+        damping = type(dt)(0.0) * point
+        rubbing = type(dt)(0.0) * point
+        touches = bool(False)
+        query = wp.hash_grid_query(grid, point, search)
+        b = wp.int32(0)
+        while wp.hash_grid_query_next(query, b):
+            if b != a:
+                offset = point - points[b]
+                reach = skin.radius[a] + skin.radius[b]
+                if wp.length(offset) < reach and may_collide(skin, reach, a, b):
+                    touches = True
+                    j = skin.particles[b]
+                    velocity = vectors.load(v, i) - vectors.load(v, j)
+                    reduced = mass[i] * mass[j] / (mass[i] + mass[j])
+                    force, overlap = pair_force(
+                        offset, velocity, reach, skin.stiffness, skin.damping, skin.friction, reduced, dt
+                    )
+                    total += force
+                    normal = wp.normalize(offset)
+                    push = wp.dot(force, normal)
+                    damping += (push - skin.stiffness * overlap) * normal
+                    rubbing += force - push * normal
+        # Adding nothing would still turn -0 into 0, and culling would be seen in the bits.
+        if touches:
+            so_far = vectors.load(f, i) + total
+            vectors.store(f, i, so_far)
+            velocity = vectors.load(v, i) + ahead * inv_mass[i] * so_far
+            losses[0, a] -= wp.float64(loss_weight) * wp.float64(wp.dot(damping, velocity))
+            losses[1, a] -= wp.float64(loss_weight) * wp.float64(wp.dot(rubbing, velocity))
+    turns.leave(turn, task, mine)
 
 
 @wp.kernel

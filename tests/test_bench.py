@@ -59,7 +59,7 @@ def test_figures_are_finite_and_consistent():
 def test_one_body_has_no_neighbours():
     """Leave out what needs several bodies."""
     figures = bench.measure(bench.Cubes(2), "cpu", 1, time.time())
-    assert (figures.pair_share, figures.at_once_ratio, figures.at_once_core_ratio) == (None, None, None)
+    assert (figures.pair_share, figures.at_once_ratio, figures.runs_at_once_ratio) == (None, None, None)
 
 
 def test_bodies_touch_what_they_are_measured_with():

@@ -353,7 +353,7 @@ def test_off_and_single_bodies_cost_nothing(monkeypatch: pytest.MonkeyPatch) -> 
     for changes, mode, culling, extra in [
         ({}, "off", True, []), ({"bodies": one}, "off", True, []), ({"bodies": one}, "bodies", True, []),
         ({}, "bodies", True, [*boxes, *search]), ({}, "bodies", False, search), ({}, "all", True, search),
-        ({"gap": 1.5}, "bodies", True, boxes), ({"gap": 1.5}, "bodies", False, search),
+        ({"gap": 1.5}, "bodies", True, [*boxes, search[-1]]), ({"gap": 1.5}, "bodies", False, search),
         ({"bodies": one}, "all", True, search),
     ]:  # fmt: skip
         scene = two_cubes(soft_contact={"mode": mode}, solver={"dt": 5e-4, "culling": culling}, **changes)

@@ -15,8 +15,9 @@ from worlds import make_material
 
 from warpjelly import plan
 from warpjelly.errors import SceneError
+from warpjelly.model import build
 from warpjelly.plan import plan_scene
-from warpjelly.scene import Scene
+from warpjelly.scene import ModelBody, Scene
 
 # Runs a scene and prints what was planned, the greatest memory of the process, and its pages of mapped files, in bytes.
 # How many of these there are is up to the kernel, so they are left out of what is planned and measured.
@@ -114,3 +115,44 @@ def test_a_body_that_cannot_fit_is_refused_before_it_is_made(tmp_path: Path, mon
     with pytest.raises(SceneError, match=r"particles and [0-9,]+ springs need about [34].\d GB of memory, of 3.5 GB"):
         plan_scene(Scene.model_validate(make_model(make_shell(tmp_path, 3 / 704), 704)))
     assert 0.5e9 < plan_scene(Scene.model_validate(make_model(tmp_path / "shell.ply", 256))).memory_bytes < 1.2e9
+
+
+def test_bodies_that_are_made_alike_are_made_once(tmp_path: Path, monkeypatch) -> None:
+    """Read and voxelise a model once for all bodies that differ in their places only; each becomes what it is alone."""
+    box = tmp_path / "box.ply"
+    trimesh.creation.box(extents=(1.0, 0.7, 0.4)).export(box)
+    scene = make_model(box, 6, name="plain")
+    (first,) = scene["bodies"]
+    corner = {"lower": [-1.0, -1.0, -1.0], "upper": [-0.3, -0.3, 0.0]}
+    changes: list[dict[str, Any]] = [
+        {"name": "turned", "position": [2.0, 0.0, 0.0], "rotation": [10.0, 20.0, 30.0]},
+        {"name": "pinned", "pinned": [corner], "velocity": [0.0, 1.0, 0.0], "angular_velocity": [1.0, 0.0, 0.0]},
+        {"name": "finer", "resolution": 9},
+        {"name": "stiff", "material": "stiff"},
+        {"name": "again"},
+    ]
+    bodies = [first, *({**first, **change} for change in changes)]
+    voxelized = []
+    voxelize_model = plan.voxelize_model
+
+    def count(body: ModelBody, **options: Any) -> plan.VoxelizedModel:
+        voxelized.append(body.name)
+        return voxelize_model(body, **options)
+
+    monkeypatch.setattr(plan, "voxelize_model", count)
+    together, state = build(plan_scene(Scene.model_validate({**scene, "bodies": bodies})), device="cpu")
+    assert voxelized == ["plain", "finer", "stiff"]
+    spans, classes, first_class = together.spans.numpy(), together.spring_classes.numpy(), 0
+    for part, body in zip(together.bodies, bodies, strict=True):
+        alone, start = build(plan_scene(Scene.model_validate({**scene, "bodies": [body]})), device="cpu")
+        own = spans[(spans[:, 0] >= part.particles.start) & (spans[:, 0] < part.particles.stop)]
+        offset = [part.particles.start, part.particles.start, 0, first_class]
+        np.testing.assert_array_equal(own, alone.spans.numpy() + offset)
+        last_class = first_class + len(alone.spring_classes)
+        np.testing.assert_array_equal(classes[first_class:last_class], alone.spring_classes.numpy())
+        first_class = last_class
+        for several, single in ((state.x, start.x), (state.v, start.v)):
+            np.testing.assert_array_equal(several.numpy()[:, part.particles], single.numpy())
+        inverse = together.particle_inv_mass.numpy()[part.particles]
+        np.testing.assert_array_equal(inverse, alone.particle_inv_mass.numpy())
+    assert first_class == len(classes)

@@ -43,6 +43,8 @@ TOLERANCE = 0.25
 BASELINE = Path(__file__).with_name("baseline.json")
 
 STEPS_PER_FRAME = 10
+# A run of a second.
+RUN_STEPS = 1000
 TIME_STEP = 1e-5
 # Between cubes in free fall, m.
 GAP = 0.1
@@ -131,9 +133,13 @@ class Figures:
     pair_share: float | None
     """Share of a step that contact between bodies takes where each touches its neighbours; None with one body."""
     at_once_ratio: float | None
-    """Time that the bodies take as scenes one after another, over that of one scene; None with one body."""
+    """Time that steps of the bodies take as scenes one after another, over that of one scene; None with one body."""
     at_once_core_ratio: float | None
     """The same of processor time: how much more each core does that is used."""
+    runs_at_once_ratio: float | None
+    """The same of whole runs: build a scene, capture its graphs, and make RUN_STEPS steps."""
+    runs_at_once_core_ratio: float | None
+    """The same of their processor time."""
     first_frame_seconds: float
     """From the start of a Python process to the end of the first frame, of 10 steps."""
     bytes_per_particle: float
@@ -217,6 +223,11 @@ def measure(cubes: Cubes, device: str, rounds: int, began: float) -> Figures:
         variants["touching"], variants["beside"] = touching.step, twin(touching, cubes.scene(**close))
         variants["singles"] = step_singles
     times = time_in_turn(variants, device=device, rounds=rounds)
+    if cubes.count > 1:
+        single = Cubes(cubes.particles_per_edge)
+        for _ in range(rounds):
+            times.setdefault("single_runs", []).append(time_runs([single] * cubes.count, device=device))
+            times.setdefault("run", []).append(time_runs([cubes], device=device))
 
     def ratio(above: str, below: str) -> float:
         return statistics.median(a.seconds / b.seconds for a, b in zip(times[above], times[below], strict=True))
@@ -245,6 +256,8 @@ def measure(cubes: Cubes, device: str, rounds: int, began: float) -> Figures:
         pair_share=1.0 - ratio("beside", "touching") if "touching" in times else None,
         at_once_ratio=ratio("singles", "free") if "singles" in times else None,
         at_once_core_ratio=core_ratio("singles", "free") if "singles" in times else None,
+        runs_at_once_ratio=ratio("single_runs", "run") if "run" in times else None,
+        runs_at_once_core_ratio=core_ratio("single_runs", "run") if "run" in times else None,
         first_frame_seconds=first_frame,
         bytes_per_particle=held_bytes(ground) / model.particle_count,
     )
@@ -295,6 +308,18 @@ def time_in_turn(variants: Mapping[str, Callable[[int], None]], *, device: str, 
         for name, step in variants.items():
             times[name].append(time_steps(step, counts[name], device=device))
     return times
+
+
+def time_runs(scenes: Sequence[Cubes], *, device: str) -> Slice:
+    """Time runs one after another, each from its scene to its last step; per step of all of them."""
+
+    def run(count: int) -> None:
+        for cubes in scenes:
+            sim = Simulator(cubes.scene(), device=device)
+            sim.prepare()
+            sim.step(count)
+
+    return time_steps(run, RUN_STEPS, device=device)
 
 
 def steps_for(seconds: float, seconds_per_step: float) -> int:
@@ -432,8 +457,10 @@ def table(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
         row("  gravity, integration", lambda s: share(s["integration_share"])),
         row("  contact, on the floor", lambda s: share(s["contact_share"])),
         row("  contact between bodies", lambda s: share(s["pair_share"])),
-        row("one after another, in times at once", lambda s: times(s["at_once_ratio"])),
+        row("steps one after another, in times at once", lambda s: times(s["at_once_ratio"])),
         row("  per core used", lambda s: times(s["at_once_core_ratio"])),
+        row(f"runs of {RUN_STEPS:,} steps one after another", lambda s: times(s["runs_at_once_ratio"])),
+        row("  per core used", lambda s: times(s["runs_at_once_core_ratio"])),
         row("first frame after", lambda s: f"{s['first_frame_seconds']:.2f} s"),
         row("bytes per particle", lambda s: f"{s['bytes_per_particle']:.0f}"),
     ]

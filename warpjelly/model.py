@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import zip_longest
 from typing import Any
 
 import numpy as np
@@ -144,10 +145,13 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
     shapes: list[Shape] = []
     shape_starts: list[int] = []
     first = class_count = 0
-    for body_plan in plan.bodies:
+    lattice: Lattice | None = None
+    for body_plan, next_plan in zip_longest(plan.bodies, plan.bodies[1:]):
         body, materials = body_plan.body, [scene.materials[name] for name in body_plan.materials]
         steps.info("building '%s' of %s particles", body.name, f"{body_plan.particle_count:,}")
-        lattice = body_plan.build()
+        # Bodies that follow one another and are made alike share a lattice.
+        shared = next_plan is not None and next_plan.build is body_plan.build
+        lattice = lattice or body_plan.build()
         own = slice(first, first + lattice.particle_count)
         bodies.append(Body(name=str(body.name), particles=own, unit=lattice.unit))
         shapes += shapes_of(str(body.name), lattice, scene.output, body_plan.model)
@@ -158,12 +162,13 @@ def build(plan: Plan, *, device: str) -> tuple[Model, State]:
         centers.append(place_body(lattice, materials, body, **start))
         chunks.append(np.arange(own.start, own.stop, CHUNK_SIZE, dtype=np.int32))
         classes.append(spring_classes(materials, lattice))
-        spans.append(lattice.spans)
-        # In place: the lattice is not needed any more.
+        # In place where the lattice is not needed any more.
+        spans.append(lattice.spans.copy() if shared else lattice.spans)
         spans[-1] += np.array([first, first, 0, class_count], np.int32)
         first = own.stop
         class_count += len(classes[-1])
-        del lattice
+        if not shared:
+            lattice = None
 
     def array(data: Any, dtype: Any) -> wp.array:
         # On the CPU the array is the data itself.

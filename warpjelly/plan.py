@@ -61,6 +61,8 @@ steps = logging.getLogger("warpjelly.steps")
 YOUNG_SPANS = 2
 # Springs across the boundary of two materials end spans, too: so many times the spans where a body has several.
 MIXED_SPANS = 1.5
+# Keys of a body that say where it is and what happens to it, not what it is made of.
+PLACEMENT = {"name", "position", "rotation", "velocity", "angular_velocity", "charge", "pinned"}
 # Resolutions to try where a model has no voxel; the last ones take a second.
 _FINER = [2**k for k in range(2, 11)]
 # A clip of the stage has at most so many frames, and bytes. It is what memory holds, and what a sudden end of the
@@ -79,7 +81,7 @@ class BodyPlan:
     materials: dict[str, int]
     """Number of jelly cubes of each of its materials, by name, in the order of the lattice."""
     build: Callable[[], Lattice]
-    """Makes its particles, springs and surface."""
+    """Makes its particles, springs and surface; the same function for bodies that are made alike."""
     particle_count: int
     spring_bound: int
     """No more springs than this."""
@@ -151,13 +153,20 @@ def clip_length(point_count: int) -> int:
 
 
 def plan_scene(scene: Scene) -> Plan:
-    """Find out how every body is made and count what follows from it.
+    """Find out how every body is made and count what follows from it; once for all that are made alike.
 
     Raises:
         SceneError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
     shot = _open_shot(scene)
-    plan = Plan(scene, [_plan_body(body, scene, shot) for body in scene.bodies])
+    plans: dict[str, BodyPlan] = {}
+    bodies = []
+    for body in scene.bodies:
+        making = body.model_dump_json(exclude=PLACEMENT)
+        if making not in plans:
+            plans[making] = _plan_body(body, scene, shot)
+        bodies.append(replace(plans[making], body=body))
+    plan = Plan(scene, bodies)
     if shot is not None:
         _require_meshes(shot, plan)
     most = MAX_ROW_BYTES // BYTES_PER_NUMBER[scene.solver.precision]

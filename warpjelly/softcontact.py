@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -31,7 +32,7 @@ class SoftContact:
         self._skin = skin
         self._device = state.x.device
         self.culls = culling and not skin.with_itself
-        """Whether ``add_forces`` goes by the boxes of chunks."""
+        """Whether ``search`` goes by the boxes of chunks."""
         chunk_count, body_count = len(model.chunk_body), len(model.bodies)
         with wp.ScopedDevice(self._device):
             self._body_lower, self._body_upper = (wp.zeros((3, body_count), dtype=model.real) for _ in range(2))
@@ -43,20 +44,17 @@ class SoftContact:
             self._energies = wp.zeros(len(self._points), dtype=wp.float64)
             self._overlaps = wp.zeros(len(self._points), dtype=wp.float64)
         # Kernels compile at their first launch, which must not be inside a capture.
-        self._search(dt=1.0, loss_weight=0.0, ahead=0.0)
+        self._build_grid()
 
-    def add_forces(self, lower: wp.array, upper: wp.array, *, dt: float, loss_weight: float, ahead: float) -> None:
-        """Add the forces between particles to those of the state; without a search where no body is near another.
+    def search(self, lower: wp.array, upper: wp.array) -> None:
+        """Find who may touch whom; nobody does without a grid, which is not built where no body is near another.
 
         Args:
             lower: lowest corners of the boxes around the chunks, real [3, chunk_count], m; read if ``culls``.
             upper: their highest corners.
-            dt: the time step, s.
-            loss_weight: what the power of damping and friction counts for in the losses, s.
-            ahead: losses are taken at the velocities that the forces make in this time, s.
         """
         if not self.culls:
-            self._search(dt=dt, loss_weight=loss_weight, ahead=ahead)
+            self._build_grid()
             return
         model, boxes, body_boxes = self._model, [lower, upper], [self._body_lower, self._body_upper]
         self._launch(bounds.update_body_bounds, len(model.bodies), [model.body_chunk_start, *boxes], body_boxes)
@@ -68,10 +66,33 @@ class SoftContact:
             [self._near_lower, self._near_upper, self._meetings],
         )
         if self._device.is_cpu:
-            wp.capture_if(self._meetings, self._search, dt=dt, loss_weight=loss_weight, ahead=ahead)
+            wp.capture_if(self._meetings, self._build_grid)
         else:
             # A GPU would have to wait for the host to hear of the meetings.
-            self._search(dt=dt, loss_weight=loss_weight, ahead=ahead)
+            self._build_grid()
+
+    def add_forces(self, launch: Callable[..., None], *, dt: float, loss_weight: float, ahead: float) -> None:
+        """Add the forces between particles to those of the state, after a search.
+
+        Args:
+            launch: launches a kernel whose tasks threads may share: kernel, dimensions, inputs, outputs.
+            dt: the time step, s.
+            loss_weight: what the power of damping and friction counts for in the losses, s.
+            ahead: losses are taken at the velocities that the forces make in this time, s.
+        """
+        model, state = self._model, self._state
+        lanes = 1 if self._device.is_cpu else pairs.GROUP
+        launch(
+            pairs.add_pair_forces,
+            (-(-len(self._points) // pairs.GROUP), lanes),
+            [
+                *(lanes, self._skin, model.particle_mass, model.particle_inv_mass),
+                *(self._near_lower, self._near_upper, self._meetings),
+                *(wp.uint64(self._grid.id), self._points, state.v),
+                *(model.real(dt), model.real(loss_weight), model.real(ahead), self.culls),
+            ],
+            [state.f, state.pair_losses],
+        )
 
     def measure(self) -> tuple[float, int, np.ndarray]:
         """Measure overlaps of particles.
@@ -95,18 +116,3 @@ class SoftContact:
         self._launch(pairs.gather_skin, len(self._points), [self._skin, self._state.x], [self._points])
         # Cells of two balls' width: fewer of them to search than of one, and hardly more balls.
         self._grid.build(self._points, 4.0 * self._skin.greatest_radius)
-
-    def _search(self, *, dt: float, loss_weight: float, ahead: float) -> None:
-        """Add the forces between particles."""
-        model, state = self._model, self._state
-        self._build_grid()
-        self._launch(
-            pairs.add_pair_forces,
-            len(self._points),
-            [
-                *(self._skin, model.particle_mass, model.particle_inv_mass, self._near_lower, self._near_upper),
-                *(wp.uint64(self._grid.id), self._points, state.v),
-                *(model.real(dt), model.real(loss_weight), model.real(ahead), self.culls),
-            ],
-            [state.f, state.pair_losses],
-        )

@@ -202,8 +202,8 @@ class Stepper:
                 boxes,
             )
         if self.soft is not None:
-            options = {"dt": self._dt, "loss_weight": loss_weight, "ahead": ahead}
-            self._alone(self.soft.add_forces, lower=self._lower, upper=self._upper, **options)
+            self._alone(self.soft.search, lower=self._lower, upper=self._upper)
+            self.soft.add_forces(self._launch, dt=self._dt, loss_weight=loss_weight, ahead=ahead)
         if has_colliders:
             lanes = min(self._lanes, contacts.PARALLEL_LANES)
             self._launch(
