@@ -7,6 +7,7 @@ another, of which some are enough; all are whole processes, from the start of Py
 compiled before. Pictures for the page of the batch are left out, as a single run has none.
 """
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -29,7 +30,10 @@ def measure(*arguments: object) -> float:
 
 def main() -> None:
     """Print times and their ratios."""
-    runs = int(sys.argv[1]) if len(sys.argv) > 1 else 100
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("runs", metavar="RUNS", nargs="?", type=int, default=100, help="how many runs (100)")
+    if (runs := parser.parse_args().runs) < 1:
+        parser.error(f"RUNS {runs}: at least 1")
     with tempfile.TemporaryDirectory(dir=".") as name:
         folder = Path(name).absolute()
         sweep = folder / "sweep.toml"

@@ -10,8 +10,8 @@ Sparse models are a shell one and a half cells thick, which has about 5 N^2 cell
 cells thick, of some 200 N cells. Their cost should grow like that, and not like N^3.
 """
 
+import argparse
 import resource
-import sys
 import time
 from collections.abc import Callable
 
@@ -69,7 +69,12 @@ def build(cells: Cells) -> Lattice:
 
 def main() -> None:
     """Print a row for each size."""
-    largest = int(sys.argv[1]) if len(sys.argv) > 1 else 256
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "largest", metavar="LARGEST", nargs="?", type=int, default=256, help="cells along an edge (256)"
+    )
+    if (largest := parser.parse_args().largest) < 32:
+        parser.error(f"LARGEST {largest}: at least 32")
     sizes = [size for size in (32, 64, 128, 256, 512, 1024) if size <= largest]
     triangles = make_triangles()
     voxelize(triangles, 8)

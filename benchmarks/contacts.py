@@ -8,6 +8,7 @@ speed of a cube of 32 particles per edge, whose rows are powers of two, by more 
 particles per edge with six objects is the case that the thesis "Gelatin Cubes" (USI 2023) measures.
 """
 
+import argparse
 import dataclasses
 import statistics
 import time
@@ -80,6 +81,7 @@ def measure(simulator: Simulator) -> tuple[float, float, float]:
 
 def main() -> None:
     """Print a row for each size."""
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     print("                             far from six objects         on the ground")
     print("particles  M springs/s    culling   no culling    culling   no culling")
     for size in (8, 10, 32, 64):

@@ -224,6 +224,8 @@ def main() -> None:
         parser.error(f"{unknown.pop()}: there is {', '.join(OBJECTS)}")
     if options.rounds < 1:
         parser.error(f"--rounds {options.rounds}: at least 1")
+    if (output := options.output) is not None and (output.exists() or not output.parent.is_dir()):
+        parser.error(f"{output}: {'there already' if output.exists() else 'its folder does not exist'}")
     kinds = [kind for kind in CONTENDERS if util.find_spec(kind.package) is not None]
     absent = [f"{kind.label}: not installed: {INSTALL}" for kind in CONTENDERS if kind not in kinds]
     for line in absent:
@@ -244,8 +246,8 @@ def main() -> None:
     print_race(results, [kind.label for kind in kinds])
     print_table("warpjelly", bench.table(report))
     print_targets(results, report)
-    if options.output is not None:
-        options.output.write_text(json.dumps({"peers": results, "warpjelly": report}, indent=1), encoding="utf-8")
+    if output is not None:
+        output.write_text(json.dumps({"peers": results, "warpjelly": report}, indent=1), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ block. Planned is what `warpjelly check` says of the memory, beside the peak of 
 the scene to the first state.
 """
 
+import argparse
 import json
 import os
 import subprocess
@@ -36,9 +37,12 @@ def measure(name: str) -> dict[str, float]:
         began = time.perf_counter()
         with subprocess.Popen(command, stdout=subprocess.PIPE) as child:
             assert child.stdout is not None
-            record = json.loads(child.stdout.read())
+            printed = child.stdout.read()
             _, status, usage = os.wait4(child.pid, 0)
             child.returncode = os.waitstatus_to_exitcode(status)
+        if child.returncode:
+            sys.exit(f"{name}: `warpjelly run` ended with exit code {child.returncode}")
+        record = json.loads(printed)
         return {
             "voxels": record["voxels"],
             "particles": record["particles"],
@@ -55,11 +59,17 @@ def measure(name: str) -> dict[str, float]:
 
 def main() -> None:
     """Print a row for each scene."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", metavar="SCENE", nargs="*", help=f"{', '.join(NAMES)} unless given")
+    names = parser.parse_args().scenes or NAMES
+    for name in names:
+        if not (SCENES / f"{name}.toml").is_file():
+            parser.error(f"{name}: no scene under {SCENES.name}/")
     print(
         f"{'scene':<22} {'voxels':>11} {'particles':>11} {'springs':>13} {'planned':>8} {'peak':>8} {'':>8} "
         f"{'build':>7} {'substep':>9} {'springs/s':>9} {'whole run':>9}"
     )
-    for name in sys.argv[1:] or NAMES:
+    for name in names:
         figures = measure(name)
         print(
             f"{name:<22} {figures['voxels']:>11,} {figures['particles']:>11,} {figures['springs']:>13,} "

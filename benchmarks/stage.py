@@ -7,8 +7,8 @@ most, without files that the system maps into it and takes back when it needs to
 simulated with 100 substeps a frame, with and without its stage.
 """
 
+import argparse
 import math
-import sys
 import tempfile
 import time
 from pathlib import Path
@@ -103,8 +103,12 @@ def simulate_with_stage(points: int, folder: Path) -> None:
 
 def main() -> None:
     """Print figures for writing alone, and beside a simulation."""
-    points = int(sys.argv[1]) if len(sys.argv) > 1 else 200_000
-    frames = int(sys.argv[2]) if len(sys.argv) > 2 else 200
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("points", metavar="POINTS", nargs="?", type=int, default=200_000, help="of a surface (200,000)")
+    parser.add_argument("frames", metavar="FRAMES", nargs="?", type=int, default=200, help="of a stage (200)")
+    points, frames = vars(parser.parse_args()).values()
+    if points < 4 or frames < 8:
+        parser.error(f"POINTS {points}, FRAMES {frames}: at least 4 and 8")
     with tempfile.TemporaryDirectory(dir=".") as folder:
         write_stage(points, frames, Path(folder) / "written")
         simulate_with_stage(points, Path(folder) / "simulated")

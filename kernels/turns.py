@@ -46,8 +46,8 @@ def take(turn: Turn, task: int) -> bool:
     if (mine) __atomic_fetch_add(done, 1, __ATOMIC_RELEASE);
     if (task < turn.tasks - 1) return;
     using function = auto (*)() -> int;
-    for (int looked = 0; __atomic_load_n(done, __ATOMIC_ACQUIRE) < turn.tasks; ++looked) {{
-        if (looked >= {PATIENCE}) ((function)turn.give_way)();
+    for (int looked = 0; __atomic_load_n(done, __ATOMIC_ACQUIRE) < turn.tasks; looked += looked < {PATIENCE}) {{
+        if (looked == {PATIENCE}) ((function)turn.give_way)();
         #if defined(__x86_64__)
         else __builtin_ia32_pause();
         #elif defined(__aarch64__)

@@ -4,9 +4,10 @@ from typing import Any
 
 import warp as wp
 
-# For native code: row(q, component) points to a row of an array, whose rows may have gaps between them.
+# For native code: row(q, component) points to a row of an array, whose rows may have gaps between them. Each has less
+# than 2^31 bytes, but two of them together may have more.
 ROW = """
-    auto row = [](auto& q, int component) { return (decltype(q.data))((char*)q.data + component * q.strides[0]); };
+    auto row = [](auto& q, size_t component) { return (decltype(q.data))((char*)q.data + component * q.strides[0]); };
 """
 # For native code: each(begin, end, body) calls body(i) for i = begin, begin + lanes ... before end, in any order. Where
 # lanes is 1, as on a CPU, it does so in vector instructions: whole ones first, and the rest in one that is masked, if

@@ -12,27 +12,32 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 import warp as wp
+from hypothesis import given
+from hypothesis import strategies as st
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from runs import CUBE, samples_of
 
 import warpjelly as wj
-from warpjelly.batch import pool
-from warpjelly.batch.batch import RunsFailedError, estimate_batch, run_batch
+from warpjelly.batch import ledger, pool
+from warpjelly.batch.batch import BatchInterruptedError, RunsFailedError, estimate_batch, run_batch
+from warpjelly.batch.cluster import RayEngine
 from warpjelly.batch.display import Live
 from warpjelly.batch.jobs import Job, Result, Watcher
 from warpjelly.batch.perform import perform
 from warpjelly.batch.pool import LocalEngine
 from warpjelly.batch.sweep import Sweep
-from warpjelly.errors import EnvironmentFailedError, InputError, verdict
+from warpjelly.errors import INTERRUPTED, EnvironmentFailedError, InputError, verdict
 from warpjelly.machine import available_cores
 from warpjelly.scenefile import load_scene
 from warpjelly.stage.validate import stage_problems
@@ -328,6 +333,33 @@ def test_ctrl_c_ends_runs_after_their_frame_and_resume_goes_on(base, tmp_path, s
     assert_whole(cli.folder, base, values, LONG, tmp_path)
 
 
+def test_a_second_ctrl_c_ends_runs_at_once(base, tmp_path, start):
+    """Interrupt a batch twice whose run does not get to the end of its frame."""
+    cli = start(write_sweep(tmp_path, base, [50, 100], LONG), "--workers=1")
+    worker = cli.wait_for(cli.writer_of("k50"))
+    os.kill(worker, signal.SIGSTOP)
+    cli.process.send_signal(signal.SIGINT)
+    # One that is not heard yet would be the same one.
+    time.sleep(1.0)
+    cli.process.send_signal(signal.SIGINT)
+    code, _, err = cli.end()
+    assert (code, err.splitlines()[-1]) == (130, "error: interrupted")
+    assert not is_alive(worker)
+    assert cli.record()["counts"] == {"runs": 2, "finished": 0, "failed": 0, "unfinished": 2}
+
+
+def test_ctrl_c_while_runs_are_drawn_leaves_a_page_without_pictures(base, tmp_path, monkeypatch):
+    """Interrupt what draws."""
+
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warpjelly.previews.thumbnails.draw_thumbnails", interrupted)
+    with pytest.raises(BatchInterruptedError, match="interrupted: 1 of 1 runs are finished"):
+        run_batch(make_sweep(base, [50]), output=tmp_path / "out", engine=Here(), pictures=True)
+    assert "The runs were not drawn" in (tmp_path / "out" / "index.html").read_text()
+
+
 def test_a_run_that_exhausts_memory_leaves_the_others_alone(base, tmp_path, start):
     """Limit memory to what a small run needs and some more, and ask for a body that needs far more than that."""
     probe = (
@@ -402,6 +434,90 @@ def test_finished_runs_are_known_by_what_they_simulate(base, tmp_path):
     assert [run["attempts"] for run in batch.record["runs"]] == [0, 0, 0]
     batch = run_batch(other, output=folder, engine=Here(), force=True)
     assert [run["attempts"] for run in batch.record["runs"]] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("values", [[40, 50, 60, 70], [70, 50], [60, 50, 70, 40]])
+def test_finished_runs_are_known_where_names_have_changed_places(base, tmp_path, values):
+    """Number the runs, and resume with a value before the old ones, in another order, and fewer: none is done twice."""
+    folder = tmp_path / "out"
+
+    def numbered(values: list[float]) -> Sweep:
+        return make_sweep(base, values).model_copy(update={"name": "{number}"})
+
+    run_batch(numbered([50, 60, 70]), output=folder, engine=Here())
+    before = {value: samples_of(folder / str(number)) for number, value in enumerate((50, 60, 70), 1)}
+    batch = run_batch(numbered(values), output=folder, engine=Here(), resume=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [int(value not in before) for value in values]
+    for run, value in zip(batch.record["runs"], values, strict=True):
+        assert run["scene_hash"] == json.loads((folder / run["name"] / "run.json").read_text())["scene_hash"]
+        assert value not in before or samples_of(folder / run["name"]) == before[value]
+    # Those that are not asked for are still there.
+    assert len(list(folder.glob("*/stage.usdc"))) == len({50, 60, 70, *values})
+    # One for which there is no place any more is only replaced if that is asked for.
+    fewer = numbered([30, *values[:-1]])
+    with pytest.raises(InputError, match="holds a finished run of another scene"):
+        run_batch(fewer, output=folder, engine=Here(), resume=True)
+    batch = run_batch(fewer, output=folder, engine=Here(), resume=True, force=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [1, *[0] * len(values[:-1])]
+
+
+@given(
+    there=st.lists(st.sampled_from("ABCD?"), max_size=5),
+    wanted=st.lists(st.sampled_from("ABCDE"), max_size=5),
+)
+def test_folders_change_places_without_losing_any(there, wanted):
+    """Have folders with finished and other contents, and ask for some under any names: all are kept, and each found."""
+    with tempfile.TemporaryDirectory() as place, pytest.MonkeyPatch.context() as patch:
+        folder = Path(place)
+        for number, content in enumerate(there):
+            (folder / str(number)).mkdir()
+            (folder / str(number) / "run.json").write_text(f'"{content}"')
+
+        def content_of(path: Path) -> str:
+            return json.loads((path / "run.json").read_text())
+
+        patch.setattr(ledger, "_finished", lambda path: content if (content := content_of(path)) != "?" else None)
+        hashes = {str(number): content for number, content in enumerate(wanted)}
+        finished, places = ledger._find_finished(folder, hashes)
+        ledger._move(folder, places)
+        found = {path.name: content_of(path) for path in folder.iterdir()}
+        assert sorted(found.values()) == sorted(there)
+        assert {name for name, content in hashes.items() if found.get(name) == content} == finished
+        # As many of each scene as there are, or as are asked for, which of equal ones is left to chance.
+        for content in set(wanted):
+            assert sum(hashes[name] == content for name in finished) >= (content in there)
+
+
+def test_what_is_not_whole_is_done_again_and_what_is_no_run_is_left_alone(base, tmp_path):
+    """Take stage, metrics or record from finished runs, and have a folder of something else; the others stay."""
+    folder = tmp_path / "out"
+    values = [50, 60, 70]
+    run_batch(make_sweep(base, values), output=folder, engine=Here())
+    (folder / "k50" / "stage.usdc").unlink()
+    (folder / "k60" / "metrics.csv").unlink()
+    for number, text in enumerate(("{}", "[]", "3", "nothing")):
+        (folder / f"else{number}").mkdir()
+        (folder / f"else{number}" / "run.json").write_text(text)
+    batch = run_batch(make_sweep(base, values), output=folder, engine=Here(), resume=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [1, 1, 0]
+    assert all((folder / run["stage"]).is_file() for run in batch.record["runs"])
+    (folder / "k50" / "run.json").write_text("[]")
+    with pytest.raises(InputError, match=r"out/k50: holds a finished run of another scene or version, or one that can"):
+        run_batch(make_sweep(base, values), output=folder, engine=Here(), resume=True)
+    batch = run_batch(make_sweep(base, values), output=folder, engine=Here(), resume=True, force=True)
+    assert [run["attempts"] for run in batch.record["runs"]] == [1, 0, 0]
+    assert (folder / "else1" / "run.json").read_text() == "[]"
+
+
+@pytest.mark.parametrize("name", ["index.html", "batch.csv", "comparison.usda"])
+def test_files_of_others_are_not_replaced(base, tmp_path, name):
+    """Have a file in the folder that a batch would write, of something else."""
+    (tmp_path / name).write_text("mine")
+    for resume in (False, True):
+        with pytest.raises(InputError, match=f"{name}: not of a batch, and a batch would replace it; choose another"):
+            run_batch(make_sweep(base, [50]), output=tmp_path, engine=Here(), resume=resume)
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+    assert (tmp_path / name).read_text() == "mine"
 
 
 def test_a_run_that_diverged_is_done_again_and_fails_again(base, tmp_path):
@@ -503,6 +619,7 @@ def test_dry_run_lists_runs_and_what_they_take(base, tmp_path, start):
     assert first.items() >= {"name": "k50", "frames": 10, "particles": 27, "problem": None}.items()
     assert "must be greater" in wrong["problem"]
     assert estimate["memory_bytes"] == first["memory_bytes"] + second["memory_bytes"]
+    assert estimate_batch(make_sweep(base, [50]), workers=9, device="cpu")["workers"] == 1
     assert estimate["seconds"] == pytest.approx(max(first["seconds"], second["seconds"]))
     longer = estimate_batch(make_sweep(base, [50, 100]), frames=19, workers=1, device="cpu")
     assert longer["seconds"] == pytest.approx(sum(run["seconds"] for run in longer["runs"]))
@@ -557,7 +674,10 @@ def test_the_live_display_shows_the_batch_and_every_worker(base):
         assert re.search(r"batch.*3/5 runs, [\d,]+ frames/s, \d:\d\d left", shown)
         assert "k[1]" in shown
         assert "4/10 frames" in shown
-        live.end("1", first, Result("k[1]", 3, "it diverged"))
+        # Another worker goes on with it.
+        live.advance("3", first, 4)
+        assert live.frames_done == 4 + 1
+        live.end("3", first, Result("k[1]", 3, "it diverged"))
         live.end("2", second, Result("k2", 0, None))
         progress.refresh()
         last = terminal.getvalue()[len(shown) :]
@@ -565,6 +685,13 @@ def test_the_live_display_shows_the_batch_and_every_worker(base):
         assert "k2: finished" not in last
         assert re.search(r"5/5 runs \(1 failed\), [\d,]+ frames/s, 0:00 left", last)
         assert live.frames_done == 4 + 10
+        live.begin([first], done=0)
+        live.advance("1", first, 4)
+        live.end("1", first, Result("k[1]", INTERRUPTED, "interrupted after 4 of 10 frames"))
+        progress.refresh()
+        last = terminal.getvalue()
+        assert re.search(r"k\[1\] .* interrupted", last)
+        assert "(2 failed)" not in last
 
 
 def test_unforeseen_errors_are_told_and_logged(base, tmp_path, monkeypatch):
@@ -590,3 +717,16 @@ def test_an_engine_gives_its_gpus_to_the_workers_in_turn(monkeypatch):
     assert LocalEngine(workers=5).workers == 5
     assert LocalEngine(workers=5, most=3).workers == 3
     assert LocalEngine(device="cpu").workers == available_cores()
+    for workers in (0, -1):
+        for make in (LocalEngine, RayEngine):
+            with pytest.raises(InputError, match=f"workers = {workers}: must be at least 1"):
+                make(workers=workers)
+
+
+def test_a_process_may_be_killed_by_a_signal_without_a_name():
+    """Bury a worker that a signal of the system's own has ended."""
+    worker = object.__new__(pool._Worker)
+    worker._ready = True
+    for number, name in ((signal.SIGSEGV, "SIGSEGV"), (35, "signal 35")):
+        worker._process = SimpleNamespace(wait=lambda number=number: -number)  # type: ignore[assignment]
+        assert worker.bury() == f"its process was killed by {name}"

@@ -1,9 +1,10 @@
 import dataclasses
 import json
 import math
+import os
 import sys
 import time
-from importlib import util
+from importlib import import_module, util
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -27,8 +28,8 @@ REPORT_KEYS = {
 
 
 def write_baseline(path: Path, ratio: float, device: str = "cpu") -> Path:
-    """Write a baseline in which each scene has some ratio to the reference kernel."""
-    scenes = {name: {"reference_ratio": ratio} for name in bench.SCENES}
+    """Write a baseline of 4 cores in which each scene used 2 and has some ratio to the reference kernel."""
+    scenes = {name: {"reference_ratio": ratio, "cores_used": 2.0} for name in bench.SCENES}
     path.write_text(json.dumps({"device": device, "device_name": "a processor", "cores": 4, "scenes": scenes}))
     return path
 
@@ -54,6 +55,25 @@ def test_figures_are_finite_and_consistent():
     assert figures.pair_share < 1.0
     assert figures.integration_share > 0.0
     assert figures.first_frame_seconds > 0.0
+
+
+def test_figures_are_the_ratios_that_they_are_called(monkeypatch):
+    """Put each variant above or below the line where it belongs, given how long each takes."""
+    seconds = {"free": 2.0, "reference": 30.0, "rk4": 9.0, "dust": 0.5, "ground": 2.5, "standing": 2.0,
+               "touching": 4.0, "beside": 3.0, "singles": 3.0}  # fmt: skip
+    slices = {name: bench.Slice(each, 2.0 if name == "free" else 1.0) for name, each in seconds.items()}
+    monkeypatch.setattr(bench, "time_in_turn", lambda variants, **_: {name: [slices[name]] * 2 for name in variants})
+    runs = {1: bench.Slice(3.0, 2.0), 2: bench.Slice(12.0, 1.0)}
+    monkeypatch.setattr(bench, "time_runs", lambda scenes, **_: runs[len(scenes)])
+    figures = bench.measure(bench.Cubes(2, count=2), "cpu", 2, time.time() - 100.0)
+    assert (figures.seconds_per_substep, figures.substeps_per_second, figures.cores_used) == (2.0, 0.5, 2.0)
+    assert figures.springs_per_second == figures.springs / 2.0
+    assert (figures.reference_ratio, figures.rk4_ratio) == (15.0, 4.5)
+    assert (figures.integration_share, figures.pair_share) == (0.25, 0.25)
+    assert figures.contact_share == pytest.approx(0.2)
+    assert (figures.at_once_ratio, figures.at_once_core_ratio) == (1.5, 0.75)
+    assert (figures.runs_at_once_ratio, figures.runs_at_once_core_ratio) == (4.0, 2.0)
+    assert figures.first_frame_seconds >= 100.0
 
 
 def test_one_body_has_no_neighbours():
@@ -118,14 +138,18 @@ def test_memory_counts_each_array_once():
     assert bench.held_bytes(masses) == 27 * 4
 
 
-@pytest.mark.parametrize(("now", "slower"), [(7.4, True), (7.6, False), (10.0, False), (30.0, False)])
-def test_regressions_go_by_the_ratio_to_the_reference_kernel(tmp_path, now, slower):
-    """Warn of a scene that lost more than a quarter, and name both ratios and the machine of the baseline."""
+@pytest.mark.parametrize(
+    ("now", "cores", "slower"),
+    [(7.4, 4, "10.00"), (7.6, 4, ""), (30.0, 4, ""), (7.4, 2, "10.00"), (3.8, 1, ""), (3.7, 1, "5.00")],
+)
+def test_regressions_go_by_the_ratio_to_the_reference_kernel(tmp_path, now, cores, slower):
+    """Warn of a scene that lost more than a quarter of what it may have here, and name the machine of the baseline."""
     baseline = bench.read_baseline(write_baseline(tmp_path / "then.json", 10.0))
-    lines = bench.regressions({"cube_8": figures_of(now), "new": figures_of(0.1)}, baseline)
-    assert len(lines) == slower
+    lines = bench.regressions({"cube_8": figures_of(now), "new": figures_of(0.1)}, baseline, cores=cores)
+    assert len(lines) == bool(slower)
     for line in lines:
-        assert all(part in line for part in ("cube_8", f"{now:.2f}", "10.00", "a processor", "4 cores", "25%"))
+        words = ("cube_8", f"{now:.2f}", slower, f"with {cores} cores", "a processor with 4 cores", "25%")
+        assert all(part in line for part in words)
 
 
 def test_command_prints_one_json_object_and_warns(warpjelly, tmp_path):  # noqa: F811
@@ -143,7 +167,8 @@ def test_command_prints_one_json_object_and_warns(warpjelly, tmp_path):  # noqa:
     # What was written is a baseline: the same figures are no slower than themselves.
     ratios = bench.read_baseline(report)["reference_ratio"]
     assert ratios == {"cube_8": printed["scenes"]["cube_8"]["reference_ratio"]}
-    assert bench.regressions({"cube_8": figures_of(ratios["cube_8"])}, bench.read_baseline(report)) == []
+    own = bench.read_baseline(report)
+    assert bench.regressions({"cube_8": figures_of(ratios["cube_8"])}, own, cores=printed["cores"]) == []
 
 
 def test_command_prints_a_table(warpjelly, tmp_path):  # noqa: F811
@@ -153,6 +178,19 @@ def test_command_prints_a_table(warpjelly, tmp_path):  # noqa: F811
     assert (code, err) == (0, "")
     for words in ("6,220", "million springs/s", "share of springs", "bytes per particle", "not compared"):
         assert words in out
+
+
+def vanish(*_):
+    """End the process that measures."""
+    os._exit(1)
+
+
+def test_a_process_that_is_lost_is_named(warpjelly, monkeypatch):  # noqa: F811
+    """Say which scene was measured, with the exit code of an environment that failed."""
+    monkeypatch.setattr(bench, "measure", vanish)
+    code, out, err = warpjelly("bench", "cube_8", "--rounds", 1)
+    assert (code, out) == (4, "")
+    assert "cube_8: its process was killed; is there too little memory?" in one_line(err)
 
 
 def test_own_baseline_has_every_scene():
@@ -262,9 +300,35 @@ def test_missing_peers_are_named(monkeypatch, capsys):
     assert raced == [kind for kind in contenders.CONTENDERS if kind is not contenders.Taichi]
 
 
-def test_unknown_object_is_refused(monkeypatch, capsys):
-    """Name the objects that there are."""
-    monkeypatch.setattr(sys, "argv", ["peers.py", "cube_9"])
+@pytest.mark.parametrize(
+    ("name", "arguments", "message"),
+    [
+        ("peers", ["cube_9"], "cube_9: there is cube_8, cube_32"),
+        ("peers", ["--rounds", "0"], "--rounds 0: at least 1"),
+        ("peers", ["-o", "README.md"], "README.md: there already"),
+        ("peers", ["-o", "no/where.json"], "where.json: its folder does not exist"),
+        ("scale", ["stress_block_1m", "block"], "block: no scene under scenes/"),
+        ("batch", ["0"], "RUNS 0: at least 1"),
+        ("building", ["16"], "LARGEST 16: at least 32"),
+        ("building", ["large"], "invalid int value: 'large'"),
+        ("stage", ["3"], "POINTS 3, FRAMES 200: at least 4 and 8"),
+        ("contacts", ["8"], "unrecognized arguments: 8"),
+    ],
+)
+def test_benchmarks_refuse_what_they_cannot_do(name, arguments, message, monkeypatch, capsys):
+    """Say what is wrong before anything is measured."""
+    monkeypatch.chdir(Path(__file__).parents[1])
+    monkeypatch.setattr(sys, "argv", [f"{name}.py", *arguments])
     with pytest.raises(SystemExit, match="2"):
-        peers.main()
-    assert "cube_9" in capsys.readouterr().err
+        import_module(name).main()
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert message in err
+
+
+def test_a_large_scene_that_fails_is_named(monkeypatch):
+    """Name the scene whose run said what is wrong with it."""
+    scale = import_module("scale")
+    monkeypatch.setattr(scale.sys, "executable", "false")
+    with pytest.raises(SystemExit, match=r"^jello_cube: `warpjelly run` ended with exit code 1$"):
+        scale.measure("jello_cube")

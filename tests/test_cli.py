@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import zipfile
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -227,6 +228,17 @@ def test_an_interrupted_run_keeps_its_frames(warpjelly, tmp_path, monkeypatch):
     assert json.loads(out)["interrupted"] is True
     assert json.loads((tmp_path / "run.json").read_text())["frames"] == 4
     assert warpjelly("validate", tmp_path)[0] == 0
+
+
+def test_ctrl_c_is_told_wherever_it_comes(warpjelly, monkeypatch):
+    """Interrupt what is no run and no batch yet: one line, and 130."""
+
+    def interrupted(*_: object, **__: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("warpjelly.scenefile.load_scene", interrupted)
+    for command in ("run", "check"):
+        assert warpjelly(command, CUBE) == (130, "", "error: interrupted\n")
 
 
 @pytest.mark.parametrize(
@@ -801,13 +813,22 @@ def test_doctor_names_versions_devices_and_extras(warpjelly):
         assert part in out
 
 
-def test_help_teaches_every_command(warpjelly):
+def test_help_teaches_every_command(warpjelly, monkeypatch):
     """Show help for the program and each command, and the version."""
     code, out, _ = warpjelly("--help")
     assert code == 0
     for command in ("run", "check", "validate", "preview", "bench", "doctor"):
         assert command in out
         assert warpjelly(command, "--help")[0] == 0
+    # Paragraphs are as wide as the terminal, and the example of a sweep has its lines.
+    monkeypatch.setenv("COLUMNS", "80")
+    shown = [line.strip() for line in warpjelly("batch", "--help")[1].splitlines()]
+    assert 'base = "cube.toml"' in shown
+    written = shown[shown.index("Simulate many scenes, or one scene with many values of some keys.") + 2 :]
+    paragraph = written[: written.index("")]
+    # Each line but the last has no room for the next word; the frame takes two of 80.
+    for line, after in pairwise(paragraph):
+        assert len(line) + 1 + len(after.split()[0]) > 78
     assert warpjelly("--version")[1].startswith("warpjelly ")
 
 

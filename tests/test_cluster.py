@@ -171,6 +171,17 @@ def do(engine: RayEngine, jobs: Sequence[Job], watcher: Watcher | None = None) -
         return list(engine.run(jobs, watcher=watcher or Watcher(), stopping=stopping))
 
 
+class Remarks(Watcher):
+    """Keeps what people should know."""
+
+    def __init__(self) -> None:
+        self.said: list[str] = []
+
+    def say(self, line: str) -> None:
+        """Keep a line."""
+        self.said.append(line)
+
+
 @pytest.mark.cluster
 def test_a_killed_process_is_replaced_and_errors_are_not_repeated(nodes, start, tmp_path):
     """Kill a process of a run: that goes on where it was, to the same bits; a run that diverges is done once."""
@@ -227,16 +238,22 @@ def test_what_no_node_can_take_is_reported(nodes, tmp_path, monkeypatch):
     # As a lost process leaves it.
     (tmp_path / "large").mkdir()
     (tmp_path / "large" / "run.lock").write_text("1")
-    # More would be beyond Ray's 64 bits, of which it takes 10^-4 bytes for one.
-    large = Job("large", scene, tmp_path / "large", 10**14)
+    # More than Ray can ask for, of which it has the smallest only, and so many that they would fill its queue.
+    large = [Job("large" if n == 3 else f"larger{n}", scene, tmp_path / "large", 10**16 - n) for n in range(4)]
     odd = Job("odd", 1.0, tmp_path / "odd", 10**8)  # type: ignore[arg-type]
-    results = {result.name: result for result in do(RayEngine(address=nodes.address, device="cpu"), [large, odd])}
+    engine, remarks = RayEngine(address=nodes.address, device="cpu"), Remarks()
+    ended = do(engine, [*large, odd], remarks)
+    assert ended[0].name == "odd"
+    results = {result.name: result for result in ended}
     assert (results["odd"].exit_code, results["odd"].attempts) == (4, 1)
     assert str(results["odd"].reason).startswith("internal error: AttributeError: 'float' object has no ")
-    assert results["large"].exit_code == 4
-    assert str(results["large"].reason).startswith(
-        "no node of the cluster is large enough: it needs 100000.00 GB of memory; the largest node has "
-    )
+    why = "no node of the cluster is large enough: it needs 10000000.00 GB of memory; the largest node has "
+    assert len(results) == 5
+    for job in large:
+        assert results[job.name].exit_code == 4
+        assert str(results[job.name].reason).startswith(why)
+    (remark,) = remarks.said
+    assert remark.startswith(f"large waits for a node, at most 0.017 minutes: {why}")
 
 
 @pytest.mark.cluster
@@ -269,12 +286,6 @@ def test_a_lost_node_is_replaced_and_one_that_sees_other_folders_is_left_alone(n
     assert {run["name"]: run["attempts"] for run in record["runs"]} == {"k50": 1, "k100": 1} | {lost: 2}
     assert "going on in process" in (tmp_path / "out" / lost / "run.log").read_text()
     assert_as_alone([tmp_path / "out" / "k50", tmp_path / "out" / "k100"], tmp_path)
-
-    class Remarks(Watcher):
-        said: list[str] = []  # noqa: RUF012
-
-        def say(self, line: str) -> None:
-            self.said.append(line)
 
     # The working directory, which is another one for every process.
     monkeypatch.chdir(tmp_path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import subprocess
 import sys
 from pathlib import Path
@@ -115,6 +116,17 @@ def test_a_body_that_cannot_fit_is_refused_before_it_is_made(tmp_path: Path, mon
     with pytest.raises(SceneError, match=r"particles and [0-9,]+ springs need about [34].\d GB of memory, of 3.5 GB"):
         plan_scene(Scene.model_validate(make_model(make_shell(tmp_path, 3 / 704), 704)))
     assert 0.5e9 < plan_scene(Scene.model_validate(make_model(tmp_path / "shell.ply", 256))).memory_bytes < 1.2e9
+
+
+@pytest.mark.parametrize(("precision", "sheets"), [("float32", 32), ("float64", 16)])
+def test_more_particles_than_rows_can_hold_are_refused(precision: str, sheets: int, monkeypatch) -> None:
+    """Refuse by numbers what strides of 32 bits cannot reach: rows of 2^31 bytes and the gap behind them."""
+    monkeypatch.setattr(plan, "memory_limit", lambda: math.inf)
+    sheet = {"type": "cloth", "material": "jelly", "size": [1.0, 1.0], "particles": [4096, 4096]}
+    scene = {"materials": {"jelly": make_material()}, "solver": {"precision": precision}}
+    assert plan_scene(Scene.model_validate({**scene, "bodies": [sheet] * (sheets - 1)})).memory_bytes > 0
+    with pytest.raises(SceneError, match=rf"^{sheets * 4096**2:,} particles are more than the [0-9,]+ that arrays can"):
+        plan_scene(Scene.model_validate({**scene, "bodies": [sheet] * sheets}))
 
 
 def test_bodies_that_are_made_alike_are_made_once(tmp_path: Path, monkeypatch) -> None:

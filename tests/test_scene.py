@@ -179,6 +179,11 @@ def test_a_file_that_is_not_toml_is_refused(scene_file, text):
     assert "not valid TOML" in refusal(scene_file(text))
 
 
+def test_a_sweep_is_not_taken_for_a_scene(scene_file):
+    """Say what does the runs of a sweep where a scene is asked for."""
+    assert "a sweep, whose runs are done by 'warpjelly batch'" in refusal(scene_file('base = "cube.toml"'))
+
+
 def test_a_model_is_not_taken_for_a_scene(tmp_path):
     """Say what a scene is where a file of another kind is given."""
     for name, content in (("tree.obj", b"v 0 0 0\n"), ("stage.usdc", b"PXR-USDC\xff\x00")):
@@ -208,7 +213,7 @@ def test_a_missing_model_is_refused_by_its_full_path(scene_file):
         ("bodies.3.size", "no entry '3'"),
         ("bodies.².size", "no entry '²'"),
         ("bodies." + 5000 * "1" + ".size", "no entry '111"),
-        ("bodies.dog.size", "entries: 0 to 0"),
+        ("bodies.dog.size", "entries: 0, "),
         ("solver.dt.x", "not a table"),
         ("nonsense.key", "nonsense"),
     ],

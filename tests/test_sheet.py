@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 from browsers import opened
 from PIL import Image
 from runs import CUBE
+from shots import make_shot, shot_scene
 from stages import cube_surface, make_scene, write_stage
 
 from warpjelly.batch import report, sheet
@@ -24,10 +26,13 @@ from warpjelly.batch.sweep import Sweep
 from warpjelly.errors import EnvironmentFailedError, InputError
 from warpjelly.previews import thumbnails
 from warpjelly.previews.thumbnails import SIZE, draw_thumbnails
+from warpjelly.run import simulate
 from warpjelly.scene import Expect
 from warpjelly.stage.stagefiles import open_stage
 from warpjelly.stage.validate import stage_problems
 
+# All that may end the script that a page has it in, or be taken for a place of its template.
+REASON = "the simulation <!--<script> </script> {{PICTURES}} diverged"
 STIFFNESSES, DAMPINGS = [50, 100, 1000], [0.1, 0.5]
 
 
@@ -53,7 +58,7 @@ def a_record() -> dict[str, Any]:
             given = {"stiffness": k, "damping": d}
             runs.append(a_run(f"k{k}_d{d}", parameters=given, figures=figures, expect=expect))
     broken = {"parameters": {"stiffness": 1e9, "damping": 0.1}, "status": "failed", "log": "broken/run.log"}
-    runs.append(a_run("broken", reason="the simulation </script> diverged", figures={"bounce": 1e9}, **broken))
+    runs.append(a_run("broken", reason=REASON, figures={"bounce": 1e9}, **broken))
     runs.append(a_run("waiting", parameters={"stiffness": 7, "damping": 0.1}, status="unfinished"))
     counts = {"runs": 8, "finished": 6, "failed": 1, "unfinished": 1}
     began = "2026-01-02T03:04:05+00:00"
@@ -102,7 +107,7 @@ def test_page_tells_of_every_run(page) -> None:
     assert heads == ["name", "status", "stiffness", "damping", "bounce", "missed", "files", "reason"]
     assert "frames 10" in shown.inner_text("#constant")
     assert rows(shown)[1][:6] == ["k50_d0.5", "✓ finished", "50", "0.5", "2.071", "1"]
-    assert rows(shown)[6][2:] == ["1e9", "0.1", "1e9", "", "log ", "the simulation </script> diverged"]
+    assert rows(shown)[6][2:] == ["1e9", "0.1", "1e9", "", "log ", REASON]
     assert shown.get_attribute("#rows a", "href") == "broken/run.log"
     card = shown.locator(".card", has_text="broken")
     assert "diverged" in card.text_content()
@@ -123,6 +128,7 @@ def test_headers_sort(page) -> None:
     assert shown.get_attribute("#heads th:nth-child(5)", "aria-sort") == "ascending"
     cards = shown.eval_on_selector_all(".card b", "all => all.map(name => name.textContent)")
     assert cards[: len(ascending)] == ascending
+    assert shown.input_value("#chosen") == f"warpjelly compare {' '.join(ascending)} -o chosen.usda"
     button.press("Enter")
     assert names(shown) == ["broken", *ascending[::-1], "waiting"]
     button.press("Enter")
@@ -152,6 +158,8 @@ def test_filter_takes_words_and_conditions(page, text, expected) -> None:
     assert shown.inner_text("#shown") == f"{len(expected)} of 8 shown"
     finished = [name for name in expected if name.startswith("k")]
     assert shown.locator("#graph circle").count() == len(finished)
+    # There are no axes without values.
+    assert (shown.locator("#graph .grid").count() > 0) == bool(finished)
     command = f"warpjelly compare {' '.join(finished)} -o chosen.usda" if len(finished) > 1 else ""
     assert shown.input_value("#chosen") == command
     shown.fill("#filter", "")
@@ -296,6 +304,46 @@ def test_many_runs_have_fewer_pictures_each(drawn, monkeypatch) -> None:
     assert (found.times, len(pictures_of(found.strips["low"].image))) == ([], 1)
 
 
+@pytest.mark.egl
+def test_runs_over_a_shot_are_drawn_from_their_start_and_are_not_compared(drawn, tmp_path, caplog) -> None:
+    """Draw a run over a shot that starts at time code 1001, beside two others, which are compared without it."""
+    folder, record = drawn
+    scene = shot_scene(make_shot(tmp_path / "shot.usda"), frames=5)
+    simulate(scene, output=folder / "over", device="cpu")
+    runs = [*record["runs"][:2], a_run("over", stage="over/stage.usda", source="shot.toml")]
+    present(folder, {**record, "runs": runs}, pictures=True)
+    described, pictures = contents(folder / "index.html")
+    assert described["runs"][2]["problem"] is None
+    # The shot goes on until time code 1015, at 25 a second; without colours its end stands for the hardest impact.
+    assert described["times"][-1] == pytest.approx(14 / 25)
+    assert described["runs"][2]["impact"] == pytest.approx(14 / 25)
+    strip = pictures_of(base64.b64decode(pictures["over"]))
+    # It falls from the start on.
+    assert (strip[1] != strip[2]).any()
+    stage = open_stage(folder / "comparison.usda")
+    assert [prim.GetName() for prim in stage.GetPrimAtPath("/World/runs").GetChildren()] == ["low", "same"]
+    assert f"not in {folder / 'comparison.usda'}: {folder / 'over/stage.usda'}: has no bodies below" in caplog.text
+
+
+@pytest.mark.egl
+def test_ctrl_c_ends_drawing_between_two_runs(drawn) -> None:
+    """Draw the run that is begun to its end: what is interrupted inside VTK can crash."""
+    folder, _ = drawn
+    done: list[int] = []
+
+    def interrupt(count: int, total: int) -> None:
+        done.append(count)
+        signal.raise_signal(signal.SIGINT)
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            draw_thumbnails([{name: folder / name for name in ("low", "high")}], interrupt)
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert done == [1]
+
+
 @pytest.mark.parametrize(
     "error",
     [
@@ -318,7 +366,8 @@ def test_page_is_made_without_what_draws(drawn, monkeypatch, caplog, error) -> N
     damage, said = [line.getMessage() for line in caplog.records if line.levelname == "WARNING"]
     assert said == f"{folder / 'index.html'} has no pictures: {error}"
     # One of the runs is damaged.
-    assert damage.startswith(f"no {folder / 'comparison.usda'}: {folder / 'damaged.usdc'}: not a readable USD file")
+    assert damage.startswith(f"not in {folder / 'comparison.usda'}: {folder / 'damaged.usdc'}: not a readable USD ")
+    assert len(open_stage(folder / "comparison.usda").GetPrimAtPath("/World/runs").GetChildren()) == 4
 
 
 def test_a_batch_leaves_page_and_comparison(tmp_path) -> None:

@@ -15,6 +15,8 @@ from reference import EPSILON, ROUND_OFF, Touch, World
 from worlds import make_material, make_scene, make_voxels, set_state
 
 from warpjelly.errors import DivergedError
+from warpjelly.kernels import fields
+from warpjelly.kernels.turns import Turn
 from warpjelly.simulator import Simulator
 from warpjelly.stepping import MAX_CAPTURED_SUBSTEPS
 
@@ -544,3 +546,13 @@ def test_surfaces_show_the_state(precision: str, device: str) -> None:
     assert len(shown[0].points) == 54
     outward = shown[0].points - x[:27].mean(axis=0)
     assert ((shown[0].normals * outward).sum(axis=1) > 0).all()
+
+
+def test_rows_may_be_more_than_a_gigabyte_apart() -> None:
+    """Write to all three rows of an array for 300 million particles, in native code: it takes no memory untouched."""
+    rows, count = wp.empty((3, 300_000_000), dtype=wp.float32, device="cpu"), 70
+    f = rows[:, :count]
+    inputs = [wp.array([0, count], dtype=wp.int32, device="cpu"), 1, wp.ones(count, dtype=wp.float32, device="cpu")]
+    gravity = wp.array([[1.0, 2.0, 3.0]], dtype=wp.vec3f, device="cpu")
+    wp.launch(fields.set_gravity_forces, (1, 1), inputs=[Turn(), *inputs, gravity], outputs=[f], device="cpu")
+    np.testing.assert_array_equal(f.numpy(), np.repeat([[1.0], [2.0], [3.0]], count, axis=1))

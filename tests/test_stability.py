@@ -597,9 +597,12 @@ def test_a_diverged_run_names_the_limit_that_was_broken() -> None:
     limit = simulator.step_limits(contacts=False)["semi_implicit_euler"]
     rng = np.random.default_rng(1)
     set_state(simulator, x=simulator.positions + 0.01 * rng.standard_normal((27, 3)))
-    with pytest.raises(DivergedError, match=f"0.01 s is above the largest stable one of the springs, {limit:.4g} s"):
+    with pytest.raises(
+        DivergedError, match=f"0.01 s is above the largest stable one of the springs, {limit:.4g} s"
+    ) as told:
         for _ in range(1000):
             simulator.advance_frame()
+    assert str(told.value).count("lower solver.dt") == 1
 
 
 def test_limits_belong_to_the_start() -> None:

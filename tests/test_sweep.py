@@ -125,8 +125,14 @@ def test_names_are_made_from_values(tmp_path):
     both = f'[vary]\n"{STIFFNESS}" = [10]\n"materials.jelly.shear.stiffness" = [3]\n'
     assert names(both) == ["structural.stiffness-10_shear.stiffness-3"]
     assert names('name = "k{' + STIFFNESS + ':06.2f}_{number}"\n' + vary) == ["k010.00_1", "k020.50_2"]
+    assert names('name = "{number}_{number:03}"\n[vary]\nx = { range = [1, 10], count = 10 }')[::9] == [
+        "01_001",
+        "10_010",
+    ]
     assert names('[vary]\n"bodies.0.file" = ["../a/b.obj", "a b.obj"]') == ["file-.._a_b.obj", "file-a_b.obj"]
     assert names('[vary]\n"bodies.0.file" = ["a/b.obj", "a b.obj"]') == ["run_1", "run_2"]
+    assert names('[vary]\n"bodies.0.file" = ["a.obj", "A.obj"]') == ["run_1", "run_2"]
+    assert names(f'[vary]\n"{STIFFNESS}" = {{ range = [1, 10000], count = 10000 }}')[-1] == "stiffness-10000"
     assert names("[vary]\nx = [" + ", ".join(f"'{'x' * 99}{i:02}'" for i in range(12)) + "]")[-1] == "run_12"
 
 
@@ -142,17 +148,24 @@ def test_names_are_made_from_values(tmp_path):
         ("[vary]\nx = { uniform = [0, 2], range = [0, 2], count = 3 }", "give one of values, range"),
         ("[vary]\nx = { values = [1], count = 3 }", "vary.x.count = 3"),
         ("[vary]\nx = { uniform = [0, 2], count = 0 }", "vary.x.count = 0"),
+        ("[vary]\nx = { range = [0, 2], count = 1 }", "vary.x.count = 1: a range has both its ends"),
+        ('combine = "zip"\n[vary]\nx = { log_range = [1, 2] }\ny = [1]', "vary.x.count = 1: a range has both its ends"),
+        ("[vary]\nx = [1, nan]", "vary.x.values.1 = NaN: no scene takes numbers that are not finite"),
+        ("[vary]\nx = [[1, { y = -inf }]]", "vary.x.values.0 = "),
         ("[vary]\nx = { range = [0, 2], count = 10000 }\ny = [1, 2]", "makes 20,000 runs"),
         ('combine = "zip"\n[vary]\nx = [1, 2]\ny = [1, 2, 3]', "x has 2, y has 3"),
         ('combine = "zip"\n[vary]\nx = { uniform = [0, 1] }', "vary.x.count: missing"),
         ('combine = "sum"\n[vary]\nx = [1]', "combine = \"sum\": must be 'product' or 'zip'"),
         ("[vary]\nx = [1]\n[vary.y]\nkeys = ['x']\nvalues = [1]", "is what 'x' varies, too"),
         ("[vary]\nx = [1]\n[set]\nx = 1", "set.x = 1: is what 'x' varies"),
+        ("[vary]\nx = [[1, 2]]\n[set]\nx.0 = 1", "set.x.0 = 1: is what 'x' varies"),
+        ('[vary]\n"x.0" = [1]\n"x" = [[1, 2]]', "vary.x.0 = \"x.0\": is a part of what 'x' varies"),
         ("", "vary: missing; this key is required"),
         ("[vary]", "vary"),
         ("sed = 3\n[vary]\nx = [1]", "sed: unknown key; did you mean 'seed'?"),
         ('name = "{y}"\n[vary]\nx = [1]', "name = \"{y}\": no parameter 'y'; known: x, number"),
         ('name = "{x"\n[vary]\nx = [1]', 'name = "{x"'),
+        ('name = "{number}"\n[vary]\nnumber = [1]', "{number} is that of the run"),
         ('name = "{x!r}"\n[vary]\nx = [1]', "{x} takes no conversion"),
         ('name = "{x:d}"\n[vary]\nx = [0.5]', "{x:d} cannot write 0.5"),
         ('name = "a"\n[vary]\nx = [1, 2]', "2 runs are called 'a'"),
@@ -160,6 +173,7 @@ def test_names_are_made_from_values(tmp_path):
         ('name = "/elsewhere/{x}"\n[vary]\nx = [1]', "cannot be called '/elsewhere/1'"),
         ('name = "a\\\\{x}"\n[vary]\nx = [1]', "its folder would not be in that of the batch"),
         ('name = "..{x}"\n[vary]\nx = [""]', "cannot be called '..'"),
+        ('name = "{x}"\n[vary]\nx = ["a."]', "names are of letters"),
         ('name = ".{x}"\n[vary]\nx = [1]', "names are of letters"),
         ('name = "b{x}"\n[vary]\nx = ["atch.json"]', "'batch.json': this name is reserved"),
         ('name = "Index.{x}"\n[vary]\nx = ["html"]', "this name is reserved"),
@@ -189,6 +203,10 @@ def test_a_base_that_is_not_there_or_a_key_that_no_run_can_have_is_refused(tmp_p
     path = write_sweep(tmp_path, '[vary]\n"solver.dt" = [1e-3, 2e-3]')
     with pytest.raises(InputError, match=r"sweep.toml: solver.dt: the sweep varies it"):
         read_specs([path], overrides={"solver.dt": 1e-4})
+    path = write_sweep(tmp_path, '[vary]\nduration = [1.0, 2.0]\n"bodies.cube.position" = [[0.0, 2.0, 0.0]]')
+    for asked in ({"frames": 3}, {"overrides": {"duration": 3.0}}, {"overrides": {"bodies.cube.position.1": 3.0}}):
+        with pytest.raises(InputError, match=r"sweep.toml: (duration|bodies.cube.position.1): the sweep varies it"):
+            read_specs([path], **asked)
 
 
 def test_one_wrong_value_is_a_problem_of_its_run_alone(tmp_path):
@@ -212,6 +230,9 @@ def test_folders_give_their_scenes_and_equal_names_get_their_folders(tmp_path):
     assert "bodies = 3: must be a list" in str(broken.problem)
     cubes = read_specs([tmp_path / "a" / "cube.toml", tmp_path / "b" / "cube.toml"])
     assert [entry.name for entry in cubes] == ["a_cube", "b_cube"]
+    (tmp_path / "b" / "cube.toml").write_text("name = 'CUBE'\n" + CUBE.read_text())
+    cubes = read_specs([tmp_path / "a" / "cube.toml", tmp_path / "b" / "cube.toml"])
+    assert [entry.name for entry in cubes] == ["a_cube", "b_CUBE"]
     with pytest.raises(InputError, match="two runs are called 'a_cube'"):
         read_specs([tmp_path / "a" / "cube.toml"] * 2)
     (tmp_path / "empty").mkdir()
@@ -228,6 +249,12 @@ def test_sweeps_and_scenes_can_be_made_in_python():
     entries = read_specs([sweep, {"whole": scene}])
     assert [entry.name for entry in entries] == ["dt-0.001", "dt-0.002", "whole"]
     assert entries[2].scene is scene
+    whole = {"bodies.cube.position": [0.0, 1.0, 0.0]}
+    sweep = Sweep(base=CUBE, vary={"bodies.cube.position.1": [2.0, 3.0]}, set=whole)
+    places = [entry.scene.bodies[0].position for entry in read_specs([sweep]) if entry.scene is not None]
+    assert [list(place) for place in places] == [[0.0, 2.0, 0.0], [0.0, 3.0, 0.0]]
+    # What a run changes of it stays with the run.
+    assert sweep.set == {"bodies.cube.position": [0.0, 1.0, 0.0]}
     with pytest.raises(InputError, match=r"cannot be called '\.\./x'"):
         read_specs([{"../x": scene}])
 

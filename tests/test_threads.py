@@ -6,6 +6,7 @@ import gc
 import itertools
 import multiprocessing
 import threading
+import time
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
@@ -93,6 +94,41 @@ def test_threads_do_not_change_a_bit(integrator: str, soft: bool, precision: str
     assert (measured["overlaps"].max() > 0.0) == soft
 
 
+ODD = {
+    "dot": {"type": "network", "points": [[0.0, 0.1, 0.0]]},
+    "backwards": {"type": "network", "points": [[0.0, 0.1, 0.0], [0.0, 0.3, 0.0], [0.1, 0.3, 0.0]],
+                  "structural": [[2, 0], [1, 0]]},
+    "ribbon": {"type": "cloth", "particles": [2, 37], "size": [0.1, 1.0]},
+    "needle": make_voxels(np.ones((31, 1, 1), bool), cell_size=0.1),
+    "sheet": make_voxels(np.ones((1, 13, 17), bool), cell_size=0.1),
+    "prime": {"type": "cube", "particles_per_edge": 11},
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", [*ODD, "all"])
+def test_threads_do_not_change_odd_bodies(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Drop a lonely particle, springs from later particles to earlier ones, thin bodies and odd ones, in tiny parts."""
+    monkeypatch.setattr(parts, "MIN_PART", 2)
+    names = list(ODD) if kind == "all" else [kind]
+    # Apart by more than they are long.
+    bodies = [ODD[name] | {"name": name, "material": "jelly", "position": [4.0 * k, 0.0, 0.0]}
+              for k, name in enumerate(names)]  # fmt: skip
+    floor = {"type": "half_space", "normal": [0.0, 1.0, 0.0]}
+    scene = make_scene(
+        bodies=bodies, colliders=[floor], gravity=[0.0, -9.81, 0.0], materials={"jelly": make_material(30.0, 0.02)}
+    )
+    one, three = (Simulator(scene, device="cpu", threads=threads) for threads in (1, 3))
+    one.step(30)
+    three.step(30)
+    assert bits_of(one) == bits_of(three)
+    # The reference knows nothing without cells.
+    if kind in ("needle", "sheet", "prime"):
+        world = World(scene)
+        world.step(30)
+        # As in test_integrators.
+        np.testing.assert_allclose(one.positions, world.x, rtol=0, atol=1e-9)
+
+
 @pytest.mark.parametrize("integrator", ORDERS)
 def test_threads_follow_the_reference(integrator: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Follow a random world with fields, friction and colliders for 300 steps in small parts like the reference."""
@@ -142,11 +178,8 @@ def spans_of(kind: str) -> tuple[np.ndarray, int]:
     return lattice.spans, len(lattice.particles)
 
 
-@pytest.mark.parametrize("kind", ["cube", "flat", "long", "sparse", "cloth", "network"])
-def test_no_two_tasks_of_a_phase_touch_the_same_particle(kind: str, small_parts: None) -> None:
+def check_phases(phases: list[np.ndarray], spans: np.ndarray, particle_count: int) -> None:
     """Find every span in one task, and every particle in at most one task of a phase."""
-    spans, particle_count = spans_of(kind)
-    phases = parts.cut_spans(spans, particle_count)
     order = np.concatenate(phases)
     order = order[np.argsort(order[:, 0])]
     np.testing.assert_array_equal(order[:, 0], np.append(0, order[:-1, 1]))
@@ -158,8 +191,46 @@ def test_no_two_tasks_of_a_phase_touch_the_same_particle(kind: str, small_parts:
                 for first in (i, j):
                     assert np.isin(owner[first : first + count], (-1, number)).all()
                     owner[first : first + count] = number
-    # Most are worked on in many places at once, a body of three layers in some, what is joined at random in one.
-    assert len(order) / len(phases) >= {"flat": 1.5, "network": 1.0}.get(kind, 3.0)
+
+
+@pytest.mark.parametrize("kind", ["cube", "flat", "long", "sparse", "cloth", "network"])
+def test_no_two_tasks_of_a_phase_touch_the_same_particle(kind: str, small_parts: None) -> None:
+    """Cut bodies so that most are worked on in many places at once, and nothing waits for phases that are of no use."""
+    spans, particle_count = spans_of(kind)
+    phases = parts.cut_spans(spans, particle_count)
+    check_phases(phases, spans, particle_count)
+    # A body of two layers is worked on in some places, what is joined at random in one, in no more phases than need be.
+    assert sum(map(len, phases)) / len(phases) >= {"flat": 1.5, "network": 1.0}.get(kind, 3.0)
+    assert kind != "network" or len(phases) <= 2
+
+
+def test_spans_at_random_are_cut_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Cut spans of any length that reach anywhere within some distance, also where parts are joined to longer ones."""
+    monkeypatch.setattr(parts, "MIN_PART", 8)
+    joined = 0
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        particle_count, reach = rng.integers(200, 600), rng.integers(1, 120)
+        count = rng.integers(1, rng.choice([2, 65]), 150)
+        ends = rng.integers(0, particle_count - 64 - reach, 150)
+        ends = np.stack([ends, ends + rng.integers(1, reach + 1, 150)])
+        first, second = rng.permuted(ends, axis=0)
+        spans = np.stack([first, second, count, 0 * count], axis=1)[np.argsort(first, kind="stable")].astype(np.int32)
+        phases = parts.cut_spans(spans, int(particle_count))
+        check_phases(phases, spans, int(particle_count))
+        joined += sum(map(len, phases)) < len(np.unique(spans[:, 0] // 8))
+    assert joined > 5
+
+
+def test_large_models_have_no_more_than_some_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make the parts of a large model longer instead of more."""
+    monkeypatch.setattr(parts, "MIN_PART", 64)
+    monkeypatch.setattr(parts, "MAX_PARTS", 7)
+    spans, particle_count = spans_of("long")
+    phases = parts.cut_spans(spans, particle_count)
+    check_phases(phases, spans, particle_count)
+    # 3216 particles, which would be 51 parts; a body three cells thick has two phases.
+    assert [len(phase) for phase in phases] == [4, 3]
 
 
 def test_the_cut_follows_from_the_model_alone(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,6 +283,66 @@ def test_an_interruption_leaves_whole_blocks(small_parts: None, monkeypatch: pyt
             simulator.step(simulator.substeps)
     expected.step(simulator.substeps)
     assert simulator.state.x.numpy().tobytes() == expected.state.x.numpy().tobytes()
+    assert simulator.time == expected.time > 0.0
+
+
+def test_who_is_left_at_work_is_waited_for(small_parts: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Interrupt the wait for a helper that has not looked at its launches yet, and step on: it finds nothing to do."""
+    simulator, expected = (Simulator(make_crowd(), device="cpu", threads=threads) for threads in (2, 1))
+    assert simulator._stepper._team is not None
+    simulator.step(1)
+    simulator.prepare()
+    launch, main = team.wp.capture_launch, threading.current_thread()
+    held, release = threading.Event(), threading.Event()
+
+    def late(graph: Any) -> None:
+        if threading.current_thread() is main:
+            held.wait()
+        else:
+            held.set()
+            release.wait()
+        launch(graph)
+
+    def interrupted(helpers: Any) -> None:
+        if helpers and not release.is_set():
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(team.wp, "capture_launch", late)
+        patch.setattr(team, "wait", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            simulator.step(simulator.substeps)
+    timer = threading.Timer(0.1, release.set)
+    timer.start()
+    simulator.step(1)
+    timer.join()
+    # Whatever it still does would be seen.
+    simulator._stepper._team._helpers.shutdown()
+    expected.step(simulator.substeps + 2)
+    assert bits_of(simulator) == bits_of(expected)
+    assert simulator.time == expected.time
+
+
+def test_what_goes_wrong_in_a_helper_is_raised(small_parts: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Raise the error of one helper, but not before the other one has ended."""
+    simulator = Simulator(make_crowd(soft=False), device="cpu", threads=3)
+    simulator.step(1)
+    launch, main, begun, ended = team.wp.capture_launch, threading.current_thread(), threading.Barrier(3), []
+
+    def broken(graph: Any) -> None:
+        begun.wait()
+        if threading.current_thread() is not main:
+            if not ended:
+                ended.append("first")
+                raise RuntimeError("broken")
+            time.sleep(0.05)
+            ended.append("second")
+        launch(graph)
+
+    monkeypatch.setattr(team.wp, "capture_launch", broken)
+    with pytest.raises(RuntimeError, match="broken"):
+        simulator.step(1)
+    assert ended == ["first", "second"]
 
 
 def test_simulators_share_a_process(small_parts: None) -> None:

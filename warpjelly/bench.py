@@ -14,6 +14,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from multiprocessing import get_context
@@ -27,7 +28,7 @@ import warp as wp
 from warpjelly.kernels import springs
 
 from .device import choose_device
-from .errors import InputError
+from .errors import EnvironmentFailedError, InputError
 from .files import missing
 from .machine import available_cores
 from .scene import Scene
@@ -160,11 +161,13 @@ def run(
 
     Returns:
         The report: ``device, device_name, cores, python, warpjelly, warp-lang, numpy, rounds``; ``scenes``, the fields
-        of Figures by name of the scene; ``baseline``, the first three and ``reference_ratio`` by name of the scene, or
-        None where it is of another kind of device; ``regressions``, a line for each scene that has become slower.
+        of Figures by name of the scene; ``baseline``, the first three, and ``reference_ratio`` and ``cores_used`` by
+        name of the scene, or None where it is of another kind of device; ``regressions``, a line for each scene that
+        has become slower.
 
     Raises:
         InputError: there is no such device, or the baseline is no such report.
+        EnvironmentFailedError: the process of a scene was lost.
     """
     then: dict[str, Any] | None = read_baseline(baseline)
     device = choose_device(device)
@@ -174,9 +177,12 @@ def run(
     for name in names:
         progress(len(figures), len(names))
         with ProcessPoolExecutor(max_workers=1, mp_context=get_context("spawn")) as pool:
-            figures[name] = pool.submit(measure, SCENES[name], device, rounds, time.time()).result()
+            try:
+                figures[name] = pool.submit(measure, SCENES[name], device, rounds, time.time()).result()
+            except BrokenProcessPool as error:
+                raise EnvironmentFailedError(f"{name}: its process was killed; is there too little memory?") from error
     progress(len(figures), len(names))
-    slower = regressions(figures, then) if then is not None else []
+    slower = regressions(figures, then, cores=available_cores()) if then is not None else []
     for line in slower:
         log.warning("%s", line)
     return {
@@ -409,21 +415,31 @@ def read_baseline(path: Path) -> dict[str, Any]:
         return {
             **{key: str(report[key]) for key in ("device", "device_name")},
             "cores": int(report["cores"]),
-            "reference_ratio": {name: float(scene["reference_ratio"]) for name, scene in report["scenes"].items()},
+            **{
+                key: {name: float(scene[key]) for name, scene in report["scenes"].items()}
+                for key in ("reference_ratio", "cores_used")
+            },
         }
     except (ValueError, KeyError, TypeError, AttributeError) as error:
         raise InputError(f"{path}: not a baseline; `warpjelly bench -o FILE.json` writes one") from error
 
 
-def regressions(figures: Mapping[str, Figures], baseline: Mapping[str, Any]) -> list[str]:
-    """Say which scenes are slower than in a baseline, by their ratios to the reference kernel."""
-    ratios = baseline["reference_ratio"]
-    return [
-        f"{name}: {now.reference_ratio:.2f} times as fast as the reference kernel, but {ratios[name]:.2f} times in the "
-        f"baseline, of {baseline['device_name']} with {baseline['cores']} cores; {TOLERANCE:.0%} less are tolerated"
-        for name, now in figures.items()
-        if name in ratios and now.reference_ratio < (1.0 - TOLERANCE) * ratios[name]
-    ]
+def regressions(figures: Mapping[str, Figures], baseline: Mapping[str, Any], *, cores: int) -> list[str]:
+    """Say which scenes are slower than in a baseline, by their ratios to the reference kernel.
+
+    That runs on one core, so with fewer cores than were used then the ratio may be as much smaller.
+    """
+    lines = []
+    for name, now in figures.items():
+        if name in baseline["reference_ratio"]:
+            then = baseline["reference_ratio"][name] * min(1.0, cores / baseline["cores_used"][name])
+            if now.reference_ratio < (1.0 - TOLERANCE) * then:
+                lines.append(
+                    f"{name}: {now.reference_ratio:.2f} times as fast as the reference kernel, but {then:.2f} times "
+                    f"with {cores} cores by the baseline, of {baseline['device_name']} with {baseline['cores']} cores; "
+                    f"{TOLERANCE:.0%} less are tolerated"
+                )
+    return lines
 
 
 def table(report: Mapping[str, Any]) -> list[tuple[str, ...]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import json
 import logging
 import os
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from .errors import InputError, SceneError, WarpjellyError, listed, verdict
+from .errors import INTERRUPTED, InputError, SceneError, WarpjellyError, listed, verdict
 
 if TYPE_CHECKING:
     from .expect import Outcome
@@ -168,7 +169,8 @@ def batch(
         typer.Option(
             "-o",
             "--output",
-            help="Folder of the batch, with a run directory for each run; outputs/<name of the sweep> unless given.",
+            help="Folder of the batch, with a run directory for each run; outputs/<name of the only sweep or "
+            "folder>, or outputs/batch, unless given.",
             show_default=False,
         ),
     ] = None,
@@ -212,6 +214,12 @@ def batch(
 ) -> None:
     """Simulate many scenes, or one scene with many values of some keys.
 
+    Runs that fail do not disturb the others: the exit code is 3 then. batch.json and batch.csv in the folder of the
+    batch have parameters, figures and stage of each run, or why it failed; run.log in its run directory has what it
+    said. index.html shows the runs in any browser, comparison.usda side by side in a USD viewer. A run whose
+    process was lost is begun once more. Ctrl-C ends the runs that are under way after their current frame, and --resume
+    goes on.
+
     A sweep file names a base scene and what its keys are to be; each combination of values is a run:
 
     \b
@@ -219,12 +227,6 @@ def batch(
         \\[vary]
         "materials.jelly.structural.stiffness" = [50, 100, 200]
         "bodies.cube.position.1" = { range = [0.5, 2.0], count = 4 }
-
-    Runs that fail do not disturb the others: the exit code is 3 then. batch.json and batch.csv in the folder of the
-    batch have parameters, figures and stage of each run, or why it failed; run.log in its run directory has what it
-    said. index.html shows the runs in any browser, comparison.usda side by side in a USD viewer. A run whose
-    process was lost is begun once more. Ctrl-C ends the runs that are under way after their current frame, and --resume
-    goes on.
     """  # noqa: D301 -- \b keeps lines as they are
     from .batch.batch import BatchInterruptedError, RunsFailedError, estimate_batch, run_batch
     from .batch.display import display, list_runs, summarize
@@ -584,8 +586,8 @@ def bench(
     Figures are medians over rounds in which everything has its turn; other work on the machine widens their range.
 
     The reference kernel is the plainest that computes the forces of springs, one after another on the CPU. Measured in
-    the same rounds, it tells a slower program from a slower machine: a scene whose ratio to it is a quarter below the
-    baseline's is warned of, and the exit code stays 0.
+    the same rounds, it tells a slower program from a slower machine: a scene whose ratio to it is a quarter below what
+    the baseline promises for as many cores is warned of, and the exit code stays 0.
 
     To see what a change does to speed here: bench -o before.json, change, bench --baseline before.json.
     """
@@ -661,6 +663,11 @@ def doctor() -> None:
         print(f"  {extra:<10} {missing or 'present'}")
 
 
+# Typer keeps the line breaks of docstrings, however wide the terminal is; what is indented keeps its own.
+for _command in app.registered_commands:
+    _command.help = re.sub(r"(?<!\n)\n(?![\n ])", " ", inspect.getdoc(_command.callback) or "")
+
+
 def main() -> None:
     """Run the command line; never returns."""
     warnings = logging.StreamHandler()
@@ -702,7 +709,9 @@ def _progress(what: str) -> Iterator[Callable[[int, int], None]]:
 def _guarded() -> int:
     """Run a command and return its exit code; whatever goes wrong becomes one line on stderr."""
     try:
-        return int(app(prog_name="warpjelly", standalone_mode=False) or 0)
+        code = int(app(prog_name="warpjelly", standalone_mode=False) or 0)
+        # Typer makes Ctrl-C a number.
+        return _fail("interrupted", code) if code == INTERRUPTED else code
     except typer.TyperException as error:
         # Without arguments the help was shown, and there is nothing to add.
         if not (message := error.format_message().rstrip(".")):

@@ -12,8 +12,9 @@ from .scene import PlaneCollider, Scene, SphereCollider
 if TYPE_CHECKING:
     from .plan import BodyPlan
 
-# Warp's strides are int32, so a row of an array [3, particle_count] holds at most this many bytes.
-MAX_ROW_BYTES = 2**31 - 1
+# Warp's strides are int32, so a row of an array [3, particle_count] holds at most this many bytes: the gap behind it
+# (``model.new_rows``) is less than two pages.
+MAX_ROW_BYTES = 2**31 - 2 * 4096
 BYTES_PER_NUMBER = {"float32": 4, "float64": 8}
 
 # Pages of libraries that the process maps: how many of them count as its memory, the kernel decides.

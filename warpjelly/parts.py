@@ -45,7 +45,7 @@ def find_parts(model: Model) -> Parts:
     if device.is_cpu:
         length = _part_length(model.particle_count)
         first = np.searchsorted(chunk_start[:-1], np.arange(0, model.particle_count, length))
-        parts = np.append(np.unique(first), len(chunk_start) - 1)
+        parts = np.unique(np.append(first, len(chunk_start) - 1))
         phases = cut_spans(model.spans.numpy(), model.particle_count)
     else:
         parts, phases = np.arange(len(chunk_start)), []

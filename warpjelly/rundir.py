@@ -45,10 +45,12 @@ def read_record(folder: Path) -> dict[str, Any]:
     """
     path = folder / RECORD_NAME
     try:
-        record: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-        return {"interrupted": False, **record}
+        record = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise InputError(f"{path}: not the record of a run: {error}") from error
+    if not (isinstance(record, dict) and {"diverged", "stage"} <= record.keys()):
+        raise InputError(f"{path}: not the record of a run, which has diverged and stage")
+    return {"interrupted": False, **record}
 
 
 def write_record(folder: Path, record: Mapping[str, Any]) -> None:

@@ -58,7 +58,11 @@ def read_scene(data: dict[str, Any], path: Path) -> Scene:
     try:
         return Scene.model_validate(data, context={"folder": path.parent})
     except ValidationError as error:
-        raise InputError(f"{path}: {explain(error, Scene)}") from error
+        # Here, because it imports this module.
+        from .batch.sweep import is_sweep
+
+        what = "a sweep, whose runs are done by 'warpjelly batch'" if is_sweep(data) else explain(error, Scene)
+        raise InputError(f"{path}: {what}") from error
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -112,8 +116,8 @@ def _entry(entries: list[Any], part: str, what: str) -> int:
         return names.index(part)
     if part in (numbers := [str(i) for i in range(len(entries))]):
         return numbers.index(part)
-    known = ", ".join([f"0 to {len(entries) - 1}", *(name for name in names if name)]) if entries else "none"
-    raise InputError(f"{what}: no entry '{part}'; entries: {known}")
+    known = [" to ".join(dict.fromkeys(numbers[:1] + numbers[-1:])), *names]
+    raise InputError(f"{what}: no entry '{part}'; entries: {', '.join(filter(None, known)) or 'none'}")
 
 
 def identifier(text: str) -> str:

@@ -140,8 +140,13 @@ class Simulator:
         if count < 0:
             raise ValueError(f"cannot step back by {-count} substeps")
         frames, rest = divmod(count, self.substeps)
-        for substeps in self._frame_blocks() * frames + [1] * rest:
-            self._stepper.step(substeps)
+        try:
+            for substeps in self._frame_blocks() * frames + [1] * rest:
+                self._stepper.step(substeps)
+        except KeyboardInterrupt:
+            # Some blocks were done.
+            self.substep_count = int(self.state.step.numpy()[0])
+            raise
         self.substep_count += count
 
     def advance_frame(self) -> None:
@@ -157,9 +162,9 @@ class Simulator:
             broken = self.broken_limit() if self._limits is not None else None
             raise DivergedError(
                 f"the simulation diverged before t = {self.time:.4g} s: particle {particle - body.particles.start} of "
-                f"'{body.name}' is beyond {diagnostics.MAX_DISTANCE:g} m or {diagnostics.MAX_SPEED:g} m/s; "
-                f"{f'{broken}; ' if broken else ''}lower solver.dt (now {self.dt:.3g} s), or stiffness and damping of "
-                "its material or of a collider"
+                f"'{body.name}' is beyond {diagnostics.MAX_DISTANCE:.0e} m or {diagnostics.MAX_SPEED:.0e} m/s; "
+                f"{broken or f'lower solver.dt (now {self.dt:.3g} s)'}, or stiffness and damping of its material or "
+                "of a collider"
             )
 
     def first_lost(self) -> int | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from typing import Any
 
 import warp as wp
@@ -29,6 +29,7 @@ class Team:
     def __init__(self, threads: int, launches: int) -> None:
         self.threads = threads
         self._helpers = ThreadPoolExecutor(threads - 1) if threads > 1 else None
+        self._started: list[Future[None]] = []
         self._counts = wp.zeros((launches, 2), dtype=wp.int32, device="cpu")
         self._used = 0
         self._give_way = _give_way()
@@ -48,16 +49,22 @@ class Team:
 
     def replay(self, graphs: list[Any]) -> None:
         """Replay a graph that was captured once for all threads, or once for each of them."""
+        # Helpers are still at work if waiting for them was interrupted; cleared counters would mislead them.
+        self._wait()
         self._counts.numpy()[:] = 0
-        started: list[Future[None]] = []
         try:
             if self._helpers is not None:
                 for thread in range(1, self.threads):
-                    started.append(self._helpers.submit(wp.capture_launch, graphs[thread % len(graphs)]))
+                    self._started.append(self._helpers.submit(wp.capture_launch, graphs[thread % len(graphs)]))
             wp.capture_launch(graphs[0])
         finally:
-            for helper in started:
-                # The work is done, so who has not begun is not needed; nor would threads of a process begin that was
-                # forked off.
-                if not helper.cancel():
-                    helper.result()
+            self._wait()
+
+    def _wait(self) -> None:
+        """Wait until no helper is at work; raises what one of them raised."""
+        # The work is done, so who has not begun is not needed. In a process that was forked off nobody would.
+        self._started = [helper for helper in self._started if not helper.cancel()]
+        wait(self._started)
+        ended, self._started = self._started, []
+        for helper in ended:
+            helper.result()

@@ -2,7 +2,8 @@
 
 python scenes/sweeps/bounce.py [PICTURE.png]
 
-Runs that are finished already, in outputs/bounce, are not done again.
+Runs that are finished already, in outputs/bounce, are not done again. The plot needs matplotlib, which the extra
+``preview`` brings.
 """
 
 import sys

@@ -12,7 +12,7 @@ from ..files import locked
 from ..signals import interruptions
 from .jobs import Engine, Watcher
 from .pool import LocalEngine
-from .specs import RECORD_NAME, TABLE_NAME, Entry, Spec, default_output, read_specs
+from .specs import COMPARISON_NAME, PAGE_NAME, RECORD_NAME, TABLE_NAME, Entry, Spec, default_output, read_specs
 from .sweep import Sweep
 
 
@@ -97,8 +97,8 @@ def run_batch(
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with locked(folder):
-            if not (resume or force):
-                _refuse_to_replace(folder, entries)
+            if not force:
+                _refuse_to_replace(folder, entries, resume=resume)
             batch = _run(folder, entries, engine, watcher or Watcher(), resume=resume, force=force, pictures=pictures)
     except OSError as error:
         raise EnvironmentFailedError(f"{folder}: cannot write the batch: {error.strerror or error}") from error
@@ -107,13 +107,19 @@ def run_batch(
     return batch
 
 
-def _refuse_to_replace(folder: Path, entries: Sequence[Entry]) -> None:
-    """Raise InputError where the folder holds a batch, or anything in the place of a run."""
-    for name in [RECORD_NAME, *(entry.name for entry in entries)]:
+def _refuse_to_replace(folder: Path, entries: Sequence[Entry], *, resume: bool) -> None:
+    """Raise InputError where the folder holds a batch that is not gone on with, or files of others with its names."""
+    for name in [RECORD_NAME, *(entry.name for entry in entries)] if not resume else ():
         if (folder / name).exists():
             raise InputError(
                 f"{folder}: holds a batch already ({name}); go on with --resume, replace runs with --force, or choose "
                 "another folder with -o"
+            )
+    for name in (TABLE_NAME, PAGE_NAME, COMPARISON_NAME):
+        if (folder / name).exists() and not (folder / RECORD_NAME).exists():
+            raise InputError(
+                f"{folder / name}: not of a batch, and a batch would replace it; choose another folder with -o, or "
+                "replace it with --force"
             )
 
 
@@ -141,8 +147,12 @@ def _run(
         finally:
             batch = Batch(folder, ledger.write())
         stopped = interrupted()
-    # Whoever stops a batch does not wait for pictures.
-    present(folder, batch.record, pictures=pictures and not stopped, progress=watcher.draw)
+    # Whoever stops a batch, or has all but its pictures, does not wait for them.
+    try:
+        present(folder, batch.record, pictures=pictures and not stopped, progress=watcher.draw)
+    except KeyboardInterrupt:
+        present(folder, batch.record, pictures=False)
+        stopped = True
     if stopped:
         raise BatchInterruptedError(batch)
     return batch
@@ -167,7 +177,7 @@ def estimate_batch(
 
     entries = read_specs(_listed(specs), overrides=overrides, frames=frames)
     if engine is None:
-        count = LocalEngine(workers=workers, device=device).workers
+        count = LocalEngine(workers=workers, device=device, most=len(entries)).workers
     else:
         with engine:
             count = engine.workers

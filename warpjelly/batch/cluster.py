@@ -20,13 +20,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from ..errors import EnvironmentFailedError, InputError
-from .jobs import Job, Result, Watcher
+from .jobs import Job, Result, Watcher, require_workers
 from .rayjobs import OTHER_TOKEN, Connected, Ended, Progress, Refused, Remark
 
 # How long a port may take to answer, and the cluster behind it, s.
 PORT_PATIENCE, CLUSTER_PATIENCE = 5.0, 30.0
-# How long a job may wait for a node that is large enough for it, s: nodes may be about to come.
-NODE_PATIENCE = 60.0
+# How long a job may wait for a node that is large enough for it, s: clouds take minutes to bring one.
+NODE_PATIENCE = 600.0
 # How often the engine looks whether it is to stop, s.
 INTERVAL = 0.1
 # How long the process that speaks with Ray may take to let go of the cluster, s.
@@ -61,6 +61,7 @@ class RayEngine:
     def __init__(self, *, address: str | None = None, workers: int | None = None, device: str = "auto") -> None:
         if find_spec("ray") is None:
             raise InputError("the engine ray needs Ray: pip install 'warpjelly[cluster]'")
+        require_workers(workers)
         if device not in ("auto", "cpu", "cuda:0"):
             raise InputError(f"device {device}: on a cluster Ray chooses the GPU; give auto, cpu or cuda:0")
         self.address = address or os.environ.get(ADDRESS_VARIABLE) or HERE

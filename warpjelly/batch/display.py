@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, TaskID, TextColumn
 
+from ..errors import INTERRUPTED
 from .jobs import Job, Result, Watcher
 from .specs import COMPARISON_NAME, PAGE_NAME, TABLE_NAME
 
@@ -55,11 +56,12 @@ class Lines(Watcher):
 
     def advance(self, worker: str, job: Job, done: int) -> None:
         """Take in how far a run is."""
-        self._under_way[worker] = done
+        # By its name, as another worker may go on with it.
+        self._under_way[job.name] = done
 
     def end(self, worker: str, job: Job, result: Result) -> None:
         """Write what came of a run."""
-        done = self._under_way.pop(worker, 0)
+        done = self._under_way.pop(job.name, 0)
         if result.exit_code == 0:
             self._frames += job.scene.frame_count
         else:
@@ -67,7 +69,7 @@ class Lines(Watcher):
             self._frames += done
             self._all_frames -= job.scene.frame_count - done
         self._done += 1
-        self._failed += result.exit_code != 0
+        self._failed += result.exit_code not in (0, INTERRUPTED)
         self.tell(job, result)
 
     def draw(self, done: int, total: int) -> None:
@@ -131,9 +133,8 @@ class Live(Lines):
         super().end(worker, job, result)
         if worker in self._rows:
             frames = job.scene.frame_count
-            self._progress.update(
-                self._rows[worker], completed=frames, text="finished" if not result.reason else "failed"
-            )
+            text = {0: "finished", INTERRUPTED: "interrupted"}.get(result.exit_code, "failed")
+            self._progress.update(self._rows[worker], completed=frames, text=text)
         self._show()
 
     def draw(self, done: int, total: int) -> None:

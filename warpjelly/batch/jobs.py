@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, Self
 
+from ..errors import InputError
+
 if TYPE_CHECKING:
     from ..scene import Scene
 
@@ -39,6 +41,12 @@ class Result:
     """Why it did not finish, in one line."""
     attempts: int = 1
     """How often it was begun: again after its process was lost."""
+
+
+def require_workers(workers: int | None) -> None:
+    """Raise InputError unless a number of workers, or None for the engine's own, is one."""
+    if workers is not None and workers < 1:
+        raise InputError(f"workers = {workers}: must be at least 1")
 
 
 class Watcher:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -13,12 +14,13 @@ from typing import Any
 from ..checkpoint import scene_hash, version_of
 from ..errors import InputError, verdict
 from ..files import wait_for_lock
-from ..rundir import RECORD_NAME, read_record, write_record
+from ..rundir import RECORD_NAME, write_record
 from ..scene import Scene
+from ..stage.stagefiles import find_stage
 from .estimate import Estimator
 from .jobs import Engine, Job, Result
 from .perform import resumable
-from .report import count, describe, write_batch
+from .report import count, describe, figures_of, record_of, write_batch
 from .specs import Entry
 
 # The record is written anew at most so often, s.
@@ -107,16 +109,21 @@ def sort_out(folder: Path, entries: Sequence[Entry], *, resume: bool, force: boo
     _wait_for_orphans([folder / name for name in hashes])
     sound = [(entry, entry.scene) for entry in entries if entry.scene is not None and entry.name in hashes]
     if resume:
-        finished = _find_finished(folder, hashes)
+        finished, places = _find_finished(folder, hashes)
         results |= {name: Result(name, 0, None, attempts=0) for name in finished}
         sound = [(entry, scene) for entry, scene in sound if entry.name not in finished]
-        outdated = [entry.name for entry, scene in sound if _is_outdated(folder / entry.name, scene)]
+        outdated = [
+            there
+            for entry, scene in sound
+            if _is_outdated(there := folder / places.get(entry.name, entry.name), scene, hashes[entry.name])
+        ]
         if outdated and not force:
             more = f" (and {len(outdated) - 1} more do)" if len(outdated) > 1 else ""
             raise InputError(
-                f"{folder / outdated[0]}: holds a finished run of another scene or version{more}; replace with "
-                "--resume --force, or choose another folder with -o"
+                f"{outdated[0]}: holds a finished run of another scene or version, or one that cannot be read{more}; "
+                "replace with --resume --force, or choose another folder with -o"
             )
+        _move(folder, places)
     for entry, scene in sound:
         with _told(entry, results):
             needed = estimator.memory_bytes(scene)
@@ -141,29 +148,67 @@ def _wait_for_orphans(folders: Sequence[Path]) -> None:
         wait_for_lock(folder, until - time.monotonic())
 
 
-def _find_finished(folder: Path, hashes: Mapping[str, str]) -> set[str]:
-    """Return the names of runs that are finished, whatever they were called when they were simulated."""
-    there: dict[str, str] = {}
-    for path in folder.glob(f"*/{RECORD_NAME}"):
-        record = read_record(path.parent)
-        if not (record["interrupted"] or record["diverged"]):
-            there[path.parent.name] = record.get("scene_hash", "")
-    finished = {name for name, value in hashes.items() if there.get(name) == value}
-    spare = {value: name for name, value in there.items() if name not in finished and name not in hashes}
-    for name, value in hashes.items():
-        if name not in finished and value in spare and not (folder / name).exists():
-            old = folder / spare.pop(value)
-            old.rename(folder / name)
-            record = read_record(folder / name)
-            stage = folder / name / Path(record["stage"]).name
-            write_record(folder / name, {**record, "stage": str(stage), "run_dir": str(folder / name)})
-            finished.add(name)
-    return finished
+def _find_finished(folder: Path, hashes: Mapping[str, str]) -> tuple[set[str], dict[str, str]]:
+    """Find the runs that are finished, whatever they were called when they were simulated.
+
+    Args:
+        folder: of the batch.
+        hashes: of the scenes, by the names of the runs.
+
+    Returns:
+        The names of those that are finished; and for each folder that is to be renamed, and for each that then changes
+        places with one, where its contents are now.
+    """
+    there = {path.parent.name: found for path in folder.glob(f"*/{RECORD_NAME}") if (found := _finished(path.parent))}
+    spare = {found: name for name, found in there.items() if hashes.get(name) != found}
+    places: dict[str, str] = {}
+    for name, wanted in hashes.items():
+        if there.get(name) == wanted or wanted not in spare:
+            continue
+        old, other = spare.pop(wanted), there.get(name)
+        there[name] = there.pop(old)
+        if other is not None:
+            there[old] = other
+            if hashes.get(old) != other:
+                spare[other] = old
+        places[name], places[old] = places.get(old, old), places.get(name, name)
+    return {name for name, wanted in hashes.items() if there.get(name) == wanted}, places
 
 
-def _is_outdated(folder: Path, scene: Scene) -> bool:
-    """Say whether a folder has a finished run that does not go on to be that of a scene."""
+def _finished(folder: Path) -> str | None:
+    """Return the hash of the scene of a finished run; None where there is none with all that a batch needs of it."""
+    record = record_of(folder)
+    if record is None or record["interrupted"] or record["diverged"]:
+        return None
+    try:
+        find_stage(folder)
+        figures_of(folder, record)
+    except (InputError, OSError, ValueError, KeyError):
+        return None
+    return record.get("scene_hash", "")
+
+
+def _move(folder: Path, places: Mapping[str, str]) -> None:
+    """Give folders other names, by where their contents are now."""
+    parked = {}
+    for name, old in places.items():
+        if name != old and (folder / old).exists():
+            # Whatever ends this in the middle, finished runs are found under any name.
+            free = next(path for n in itertools.count(1) if not (path := folder / f"{old}.{n}").exists())
+            parked[name] = (folder / old).rename(free)
+    for name, path in parked.items():
+        own = path.rename(folder / name)
+        if record := record_of(own):
+            stage = str(own / Path(record["stage"]).name)
+            write_record(own, {**record, "stage": stage, "run_dir": str(own)})
+
+
+def _is_outdated(folder: Path, scene: Scene, wanted: str) -> bool:
+    """Say whether a folder has a finished run that is not, and does not go on to be, that of a scene with this hash."""
     if not (folder / RECORD_NAME).is_file():
         return False
-    record = read_record(folder)
-    return not (record["interrupted"] or record["diverged"] or resumable(folder, scene))
+    record = record_of(folder)
+    if record is None:
+        return True
+    unfinished = record["interrupted"] or record["diverged"] or record.get("scene_hash") == wanted
+    return not (unfinished or resumable(folder, scene))

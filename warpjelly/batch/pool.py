@@ -18,7 +18,7 @@ from typing import Any, Self
 from ..device import choose_device, gpus
 from ..errors import INTERRUPTED, EnvironmentFailedError
 from ..machine import available_cores, memory_limit, threads_of
-from .jobs import Job, Result, Watcher
+from .jobs import Job, Result, Watcher, require_workers
 
 # A job whose process was lost is begun so often in all.
 ATTEMPTS = 2
@@ -46,6 +46,7 @@ class LocalEngine:
     name = "local"
 
     def __init__(self, *, workers: int | None = None, device: str = "auto", most: int | None = None) -> None:
+        require_workers(workers)
         self.devices = (gpus() if device == "auto" else []) or [choose_device(device)]
         count = workers or (available_cores() if self.devices == ["cpu"] else len(self.devices))
         self.workers = count if most is None else min(count, most)
@@ -232,7 +233,8 @@ class _Worker:
         if code >= 0:
             return f"its process ended with exit code {code}"
         hint = ", as the system does when memory runs out" if code == -signal.SIGKILL else ""
-        return f"its process was killed by {signal.Signals(-code).name}{hint}"
+        known = {number.value: number.name for number in signal.Signals}
+        return f"its process was killed by {known.get(-code, f'signal {-code}')}{hint}"
 
     def dismiss(self) -> None:
         """End the process, at once if it has not ended its job or is just starting, and wait until it has."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import pickle
 import queue
@@ -45,6 +46,8 @@ OTHER_TOKEN = (
     "the cluster wants an authentication token that this machine does not have; copy the one that it was started with "
     "to ~/.ray/auth_token, and set RAY_AUTH_MODE=token"
 )
+# More memory Ray cannot ask for, bytes: it counts in 10^-4 bytes, with 64 bits.
+MOST_MEMORY = 9 * 10**14
 # What every node is labelled with by Ray.
 _NODE_LABEL = "ray.io/node-id"
 # How often to look for a file that another machine has just written, once a second.
@@ -190,6 +193,8 @@ class Drover:
         self._fanned_out = False
         self._workers, self._surveyed = -1, -SURVEY_INTERVAL
         self._nodes: list[dict[str, Any]] = []
+        # Of nodes that have the rest of what a job needs, the most memory, bytes.
+        self._largest = -1.0
         # Why a node gets no jobs, by its id.
         self._shunned: dict[str, str] = {}
         with_gpu = device == "cuda:0" or (device == "auto" and ray.cluster_resources().get("GPU", 0) >= 1)
@@ -224,6 +229,8 @@ class Drover:
         self._nodes = [node for node in self._ray.nodes() if node["Alive"] and node["NodeID"] not in self._shunned]
         offers = [node["Resources"] for node in self._nodes]
         room = sum(int(min(offer.get(what, 0) / share for what, share in self._share.items())) for offer in offers)
+        fitting = [offer for offer in offers if all(offer.get(what, 0) >= share for what, share in self._share.items())]
+        self._largest = max((offer.get("memory", 0) for offer in fitting), default=-1.0)
         workers = room if self._limit is None else min(self._limit, room)
         if workers != self._workers:
             self._workers = workers
@@ -232,47 +239,75 @@ class Drover:
             if (done := _frames_under_way(task.job.folder)) is not None:
                 self._fanned_out |= done > 0
                 _send(self._messages, Progress(str(task.slot), task.job.name, done))
-            if why := self._hopeless(task):
+            if self._is_hopeless(task):
                 self._ray.cancel(reference, force=True)
                 del self._tasks[reference]
-                result = Result(task.job.name, EnvironmentFailedError.exit_code, why, task.attempt)
-                self._tell(str(task.slot), result)
+                self._give_up(str(task.slot), task.job, task.attempt)
+                # What needs as much has waited as long.
+                for job, attempt in list(self._waiting):
+                    if job.memory_bytes >= task.job.memory_bytes:
+                        self._waiting.remove((job, attempt))
+                        self._give_up("", job, attempt)
 
-    def _hopeless(self, task: _Task) -> str | None:
-        """Say why no node will ever take a job, if none has been large enough for some time."""
-        needs = {**self._share, "memory": task.job.memory_bytes}
-        offers = [node["Resources"] for node in self._nodes]
-        if any(all(offer.get(what, 0) >= need for what, need in needs.items()) for offer in offers):
+    def _fits(self, job: Job) -> bool:
+        """Say whether there is a node that is large enough for a job."""
+        return job.memory_bytes <= self._largest
+
+    def _is_hopeless(self, task: _Task) -> bool:
+        """Say whether no node will ever take a job, as none has been large enough for some time."""
+        if self._fits(task.job):
             task.misfit_since = None
-            return None
-        self._fanned_out = True
-        if task.misfit_since is None:
-            task.misfit_since = time.monotonic()
-        if time.monotonic() < task.misfit_since + self._patience and (offers or not self._shunned):
-            return None
+            return False
+        begins = task.misfit_since is None
+        task.misfit_since = task.misfit_since or time.monotonic()
+        if time.monotonic() >= task.misfit_since + self._patience or (self._shunned and not self._nodes):
+            return True
+        if begins:
+            waits = f"{task.job.name} waits for a node, at most {self._patience / 60:.2g} minutes"
+            _send(self._messages, Remark(f"{waits}: {self._why_not(task.job)}"))
+        return False
+
+    def _why_not(self, job: Job) -> str:
+        """Say why no node takes a job."""
         told = "; ".join(self._shunned.values())
-        if not offers:
+        if not self._nodes:
             return f"no node takes it: {told or 'the cluster has none'}"
-        most = max(offer.get("memory", 0) for offer in offers)
-        gpu = " and a GPU" if "GPU" in needs else ""
+        most = max(node["Resources"].get("memory", 0) for node in self._nodes)
+        gpu = " and a GPU" if "GPU" in self._share else ""
         return (
-            f"no node of the cluster is large enough: it needs {needs['memory'] / 1e9:.2f} GB of memory{gpu}; the "
+            f"no node of the cluster is large enough: it needs {job.memory_bytes / 1e9:.2f} GB of memory{gpu}; the "
             f"largest node has {most / 1e9:.2f} GB" + (f" ({told})" if told else "")
         )
 
+    def _give_up(self, worker: str, job: Job, attempts: int) -> None:
+        self._tell(worker, Result(job.name, EnvironmentFailedError.exit_code, self._why_not(job), attempts))
+
+    def _next(self) -> tuple[Job, int] | None:
+        """Return what the cluster is to have next, if anything: no job that no node can take keeps others waiting.
+
+        Of those it has one, the smallest, for which a cluster that grows may bring a node.
+        """
+        most = self._limit if self._limit is not None else QUEUED * max(1, self._workers)
+        fitting = [self._fits(task.job) for task in self._tasks.values()]
+        if sum(fitting) < (most if self._fanned_out else 1):
+            found = next((waiting for waiting in self._waiting if self._fits(waiting[0])), None)
+            if found is not None:
+                return found
+        misfits = [waiting for waiting in self._waiting if not self._fits(waiting[0])] if all(fitting) else []
+        return min(misfits, key=lambda waiting: waiting[0].memory_bytes, default=None)
+
     def give_out(self) -> None:
         """Give the cluster as many jobs as it is to have."""
-        most = self._limit if self._limit is not None else QUEUED * max(1, self._workers)
-        most = most if self._fanned_out else 1
-        while self._waiting and len(self._tasks) < most:
-            job, attempt = self._waiting.popleft()
+        while (chosen := self._next()) is not None:
+            self._waiting.remove(chosen)
+            job, attempt = chosen
             taken = {task.slot for task in self._tasks.values()}
-            slot = next(number for number in range(1, most + 1) if number not in taken)
+            slot = next(number for number in itertools.count(1) if number not in taken)
             call = self._do_job.options(
                 name=job.name,
                 num_cpus=self._share["CPU"],
                 num_gpus=self._share.get("GPU", 0),
-                memory=job.memory_bytes,
+                memory=min(job.memory_bytes, MOST_MEMORY),
                 # Ray would begin it as the first time; we go on with it.
                 max_retries=0,
                 label_selector={_NODE_LABEL: f"!in({','.join(self._shunned)})"} if self._shunned else None,

@@ -12,7 +12,7 @@ from typing import Any
 
 from ..errors import INTERRUPTED, InputError
 from ..files import whole_file
-from ..rundir import METRICS_NAME, RECORD_NAME, read_record
+from ..rundir import METRICS_NAME, read_record
 from ..stage.stagefiles import find_stage
 from .jobs import LOG_NAME, Result
 from .specs import RECORD_NAME as BATCH_NAME
@@ -35,7 +35,7 @@ def describe(folder: Path, entry: Entry, result: Result | None, scene_hash: str 
         scene_hash: of its scene, if that can be read.
     """
     own = folder / entry.name
-    record = read_record(own) if result is not None and (own / RECORD_NAME).is_file() else {}
+    record = {} if result is None else record_of(own) or {}
     # There may be a run of another scene, in whose place this one could not begin.
     recorded = scene_hash is not None and record.get("scene_hash") == scene_hash
     return {
@@ -49,7 +49,7 @@ def describe(folder: Path, entry: Entry, result: Result | None, scene_hash: str 
         "stage": _stage_of(folder, own) if recorded else None,
         "log": f"{entry.name}/{LOG_NAME}" if result is not None and (own / LOG_NAME).is_file() else None,
         "scene_hash": scene_hash,
-        "figures": _figures(own, record) if recorded else {},
+        "figures": figures_of(own, record) if recorded else {},
         "expect": record["expect"] if recorded else [],
     }
 
@@ -67,7 +67,15 @@ def _stage_of(folder: Path, own: Path) -> str | None:
         return None
 
 
-def _figures(own: Path, record: Mapping[str, Any]) -> dict[str, float | None]:
+def record_of(own: Path) -> dict[str, Any] | None:
+    """Return the record of the run in a folder, None where there is none that can be read."""
+    try:
+        return read_record(own)
+    except InputError:
+        return None
+
+
+def figures_of(own: Path, record: Mapping[str, Any]) -> dict[str, float | None]:
     """Return the numbers that tell runs apart, by name; SI units.
 
     What a scene expects of itself is measured, so ``[expect]`` decides which quantities there are.

@@ -6,11 +6,9 @@ The page is ``sheet.html`` with a description in JSON, made of batch.json, and a
 from __future__ import annotations
 
 import base64
-import html
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,8 +17,9 @@ import numpy as np
 from ..colors import SRGB_TABLE, range_in_words
 from ..errors import EnvironmentFailedError, InputError, WarpjellyError
 from ..files import whole_file
+from ..pages import fill_page
 from ..scene import Expect
-from ..stage.comparison import Compared, write_comparison
+from ..stage.comparison import Compared, require_comparable, write_comparison
 from .report import FINISHED
 from .specs import COMPARISON_NAME, PAGE_NAME, TABLE_NAME
 from .specs import RECORD_NAME as BATCH_NAME
@@ -120,8 +119,19 @@ def compared(sources: Sequence[Path]) -> list[Compared]:
 
 
 def _compare(folder: Path, record: Mapping[str, Any]) -> None:
-    """Write the comparison of the first finished runs; where there are not two, remove that of an earlier batch."""
-    path, runs = folder / COMPARISON_NAME, finished_runs(folder, record)[:MOST_COMPARED]
+    """Write the comparison of the first finished runs that can be compared; without two, remove that of before."""
+    path, runs, wrong = folder / COMPARISON_NAME, list[Compared](), list[str]()
+    for run in finished_runs(folder, record):
+        try:
+            require_comparable(run)
+            runs.append(run)
+        except InputError as error:
+            wrong.append(str(error))
+        if len(runs) == MOST_COMPARED:
+            break
+    if wrong:
+        more = f" (and {len(wrong) - 1} more)" if len(wrong) > 1 else ""
+        log.warning("not in %s: %s%s", path, wrong[0], more)
     try:
         if len(runs) > 1:
             write_comparison(runs, path)
@@ -166,16 +176,8 @@ def _page(folder: Path, record: Mapping[str, Any], thumbnails: Thumbnails | None
         ],
     }
     pictures = {name: base64.b64encode(strip.image).decode() for name, strip in strips.items()}
-    values = {
-        "TITLE": html.escape(folder.resolve().name),
-        # A script ends at the first "</", even in a string.
-        "BATCH": json.dumps(described, allow_nan=False, default=str).replace("</", "<\\/"),
-        "PICTURES": json.dumps(pictures),
-    }
-    page = resources.files(__package__).joinpath("sheet.html").read_text(encoding="utf-8")
-    for name, value in values.items():
-        page = page.replace(f"{{{{{name}}}}}", value)
-    return page
+    tables = {"BATCH": described, "PICTURES": pictures}
+    return fill_page(__package__, "sheet.html", title=folder.resolve().name, tables=tables, texts={})
 
 
 def _told(outcome: Mapping[str, Any]) -> str:

@@ -115,10 +115,9 @@ def _entries_of_file(path: Path, overrides: dict[str, Any], frames: int | None) 
 
 
 def _entries_of_sweep(sweep: Sweep, source: str, overrides: dict[str, Any], frames: int | None) -> Iterator[Entry]:
-    varied = {key: name for name, parameter in sweep.vary.items() for key in parameter.keys or [name]}
-    for key in overrides:
-        if key in varied:
-            raise InputError(f"{source}: {key}: the sweep varies it ('{varied[key]}'), so it cannot be set as well")
+    for key in [*overrides, *(("frames", "duration") if frames is not None else ())]:
+        if name := sweep.varied_by(key):
+            raise InputError(f"{source}: {key}: the sweep varies it ('{name}'), so it cannot be set as well")
     try:
         names = run_names(sweep)
     except InputError as error:

@@ -73,6 +73,9 @@ class Parameter(Table):
             raise PydanticCustomError("parameter", "give one of {sources}", {"sources": ", ".join(_SOURCES)})
         if self.values is not None and self.count is not None:
             refuse("count", self.count, "a list has as many values as it has; leave count out")
+        for number, value in enumerate(self.values or ()):
+            if not _is_finite(value):
+                refuse(f"values.{number}", value, "no scene takes numbers that are not finite")
         for name in ("range", "log_range", "uniform", "log_uniform", "integers"):
             bounds = getattr(self, name)
             if bounds is not None and not bounds[0] < bounds[1]:
@@ -108,6 +111,15 @@ class Parameter(Table):
             assert self.integers is not None
             return [int(number) for number in rng.integers(*self.integers, count, endpoint=True)]
         return [float(f"{number:.{digits}g}") for number in numbers]
+
+
+def _is_finite(value: Any) -> bool:
+    """Say whether all numbers in a value of TOML are ones that JSON has, too."""
+    try:
+        json.dumps(value, allow_nan=False, default=str)
+    except ValueError:
+        return False
+    return True
 
 
 def _as_parameter(given: Any) -> Any:
@@ -183,9 +195,13 @@ class Sweep(Table):
             for key in parameter.keys or [name]:
                 if key in taken:
                     refuse(f"vary.{name}", key, f"is what '{taken[key]}' varies, too")
-                if key in self.set:
-                    refuse(f"set.{key}", self.set[key], f"is what '{name}' varies")
                 taken[key] = name
+        for key, name in taken.items():
+            if whole := self.varied_by(key.rpartition(".")[0]):
+                refuse(f"vary.{name}", key, f"is a part of what '{whole}' varies")
+        for key, value in self.set.items():
+            if by := self.varied_by(key):
+                refuse(f"set.{key}", value, f"is what '{by}' varies")
         lengths = {name: parameter.length for name, parameter in self.vary.items()}
         if self.combine == "zip":
             known = {length for length in lengths.values() if length is not None}
@@ -200,6 +216,9 @@ class Sweep(Table):
             for name, length in lengths.items():
                 if length is None:
                     refuse(f"vary.{name}.count", None, "missing; combine product needs the number of values")
+        for name, parameter in self.vary.items():
+            if (parameter.range or parameter.log_range) and (parameter.length or self.run_count) == 1:
+                refuse(f"vary.{name}.count", 1, "a range has both its ends, so at least 2 values")
         if self.run_count > MAX_RUNS:
             refuse("combine", self.combine, f"makes {self.run_count:,} runs; at most {MAX_RUNS:,} make sense")
         return self
@@ -209,6 +228,12 @@ class Sweep(Table):
         """Number of runs."""
         lengths = [length for parameter in self.vary.values() if (length := parameter.length) is not None]
         return math.prod(lengths) if self.combine == "product" else max(lengths)
+
+    def varied_by(self, key: str) -> str | None:
+        """Return the name of the parameter that varies a key of the scene, or a table or list that it is in."""
+        names = {varied: name for name, parameter in self.vary.items() for varied in parameter.keys or [name]}
+        parts = key.split(".")
+        return next((names[k] for n in range(len(parts), 0, -1) if (k := ".".join(parts[:n])) in names), None)
 
     def rows(self) -> Iterator[dict[str, Any]]:
         """Yield the values of the parameters by name, run by run."""
@@ -272,10 +297,10 @@ def run_names(sweep: Sweep) -> list[str]:
         names = ["_".join(f"{labels[key]}-{_written(value)}" for key, value in row.items()) for row in rows]
         unique = len({name.casefold() for name in names}) == len(names)
         return names if unique and max(map(len, names)) <= MAX_NAME else [f"run_{number}" for number in numbers]
-    parts = _parts(sweep)
+    parts = _parts(sweep, digits)
     names = [
         "".join(part.text + _filled(part, {**row, "number": number}, sweep.name) for part in parts)
-        for row, number in zip(rows, numbers, strict=True)
+        for number, row in enumerate(rows, 1)
     ]
     (name, count), *_ = Counter(names).most_common(1)
     if count > 1:
@@ -286,8 +311,8 @@ def run_names(sweep: Sweep) -> list[str]:
     return names
 
 
-def _parts(sweep: Sweep) -> list[_Part]:
-    """Take the text for names apart."""
+def _parts(sweep: Sweep, digits: int) -> list[_Part]:
+    """Take the text for names apart; numbers of runs have so many digits unless it says how to write them."""
     assert sweep.name is not None
     what = f"name = {json.dumps(sweep.name)}"
     try:
@@ -296,9 +321,12 @@ def _parts(sweep: Sweep) -> list[_Part]:
         raise InputError(f"{what}: not a text with {{parameter}}s: {error}") from error
     if converted := next((field for _, field, _, conversion in pieces if conversion), None):
         raise InputError(f"{what}: {{{converted}}} takes no conversion with !")
-    parts = [_Part(text, field, style or "") for text, field, style, _ in pieces]
+    styles = {"number": f"0{digits}"}
+    parts = [_Part(text, field, style or styles.get(field or "", "")) for text, field, style, _ in pieces]
     known = [*sweep.vary, "number"]
     for part in parts:
+        if part.parameter == "number" and "number" in sweep.vary:
+            raise InputError(f"{what}: {{number}} is that of the run; give the parameter 'number' another name")
         if part.parameter is not None and part.parameter not in known:
             raise InputError(f"{what}: no parameter '{part.parameter}'; {suggestion(part.parameter, known)}")
     return parts

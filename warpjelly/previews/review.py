@@ -9,13 +9,10 @@ and of the positions first all low bytes, then all high ones, which zlib makes t
 from __future__ import annotations
 
 import base64
-import html
-import json
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from importlib import resources
 from types import EllipsisType
 from typing import Any
 
@@ -25,6 +22,7 @@ from pxr import Usd, UsdGeom, UsdShade
 from ..colors import SRGB_TABLE, srgb_from_linear
 from ..errors import InputError
 from ..looks import Texture
+from ..pages import fill_page
 from ..polygons import triangulate
 from .eye import Eye
 from .legends import legend_of
@@ -99,16 +97,9 @@ def review_page(
         "shapes": described,
     }
     default = stage.GetDefaultPrim()
-    values = {
-        "TITLE": html.escape((Usd.ModelAPI(default).GetAssetName() if default else "") or "stage"),
-        # A script ends at the first "</", even in a string.
-        "STAGE": json.dumps(description).replace("</", "<\\/"),
-        "ARRAYS": base64.b64encode(zlib.compress(b"".join(arrays), 9)).decode(),
-    }
-    page = resources.files(__package__).joinpath("review.html").read_text(encoding="utf-8")
-    for name, value in values.items():
-        page = page.replace(f"{{{{{name}}}}}", value)
-    return page
+    title = (Usd.ModelAPI(default).GetAssetName() if default else "") or "stage"
+    packed = base64.b64encode(zlib.compress(b"".join(arrays), 9)).decode()
+    return fill_page(__package__, "review.html", title=title, tables={"STAGE": description}, texts={"ARRAYS": packed})
 
 
 def _surfaces(stage: Usd.Stage, frame: int) -> Iterator[_Shape]:

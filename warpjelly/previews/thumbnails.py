@@ -12,6 +12,7 @@ import numpy as np
 from pxr import Usd, UsdGeom
 
 from ..errors import verdict
+from ..signals import interruptions
 from ..stage.common import ForceRange, color_by, corners_of, force_range, motion_bounds, widest
 from ..stage.prims import CAMERA
 from ..stage.stagefiles import open_stage
@@ -34,7 +35,7 @@ class Strip:
     image: bytes
     """WebP: the hardest impact, and then the run at the times of all strips, each to the right of the last."""
     impact: float
-    """When that is, s."""
+    """When that is, s from its start."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +44,7 @@ class Thumbnails:
 
     strips: dict[str, Strip]
     times: list[float]
-    """Of the pictures in each strip, but for the first, s; a run that is shorter shows its end."""
+    """Of the pictures in each strip, but for the first, s from the start; a run that is shorter shows its end."""
     ranges: list[ForceRange | None]
     """Forces at both ends of the colours of each group, N."""
     problems: dict[str, str]
@@ -63,6 +64,7 @@ def draw_thumbnails(
     Raises:
         InputError: pyvista or Pillow is not installed.
         EnvironmentFailedError: there is no offscreen OpenGL.
+        KeyboardInterrupt: after the run that was drawn when Ctrl-C was pressed.
     """
     problems: dict[str, str] = {}
     shared, ends = [], [0.0]
@@ -73,13 +75,14 @@ def draw_thumbnails(
                 stage = open_stage(path)
                 seen += [corners_of(bounds)] if (bounds := motion_bounds(stage)) is not None else []
                 ranges += [forces] if (forces := force_range(stage)) is not None else []
-                ends.append(stage.GetEndTimeCode() / stage.GetTimeCodesPerSecond())
+                ends.append((stage.GetEndTimeCode() - stage.GetStartTimeCode()) / stage.GetTimeCodesPerSecond())
         shared.append((np.concatenate(seen) if seen else None, widest(ranges) if ranges else None))
     total, done = sum(map(len, groups)), 0
     count = min(_TIMES, _MOST_IN_ALL // max(total, 1))
     times = np.linspace(0.0, max(ends), count).tolist() if count > 1 else []
     strips: dict[str, Strip] = {}
-    with View(SIZE) as window:
+    # An exception at any moment, as while VTK is loading, can crash it.
+    with interruptions() as interrupted, View(SIZE) as window:
         for group, (points, forces) in zip(groups, shared, strict=True):
             for name, path in group.items():
                 if name not in problems:
@@ -87,6 +90,8 @@ def draw_thumbnails(
                         strips[name] = _draw(window, open_stage(path), times, points, forces)
                 done += 1
                 progress(done, total)
+                if interrupted():
+                    raise KeyboardInterrupt
     return Thumbnails(strips, times, [forces for _, forces in shared], problems)
 
 
@@ -115,7 +120,8 @@ def _draw(
 
     rate, first, last = stage.GetTimeCodesPerSecond(), round(stage.GetStartTimeCode()), round(stage.GetEndTimeCode())
     impact = brightest_frame(stage, first, last)
-    frames = [impact, *(min(round(time * rate), last) for time in times)]
+    # Those over a shot start when that does.
+    frames = [impact, *(min(first + round(time * rate), last) for time in times)]
     with Usd.EditContext(stage, stage.GetSessionLayer()):
         if points is not None:
             camera = UsdGeom.Camera.Get(stage, CAMERA)
@@ -129,4 +135,4 @@ def _draw(
         whole.paste(drawn[frame], (number * SIZE[0], 0))
     file = io.BytesIO()
     whole.save(file, "WEBP", quality=_QUALITY, method=_EFFORT)
-    return Strip(file.getvalue(), impact / rate)
+    return Strip(file.getvalue(), (impact - first) / rate)

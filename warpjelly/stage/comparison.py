@@ -115,11 +115,18 @@ def write_comparison(runs: Sequence[Compared], output: Path, *, columns: int | N
         raise failed_write(output, error) from error
 
 
+def require_comparable(run: Compared) -> None:
+    """Raise InputError where a run cannot be read, or has no world of its own."""
+    _read(run)
+
+
 def _read(run: Compared) -> _Read:
     stage = open_stage(run.source)
     world, bounds = stage.GetPrimAtPath(WORLD), motion_bounds(stage)
     if bounds is None:
-        raise InputError(f"{run.source}: has no bodies below {BODIES}, so it cannot be compared")
+        raise InputError(
+            f"{run.source}: has no bodies below {BODIES}, as no run over a shot has, so it cannot be compared"
+        )
     return _Read(
         path=find_stage(run.source),
         bounds=bounds,
