@@ -43,6 +43,18 @@ def spring_energy(offset: Any, rest: Any, stiffness: Any):
     return type(rest)(0.5) * stiffness * stretch * stretch
 
 
+# The lanes of a warp of a GPU, which all belong to one span, add up first: two atomic adds a span, not one a spring.
+@wp.func_native("""
+    #ifdef __CUDA_ARCH__
+    for (int lanes = 16; lanes > 0; lanes /= 2) loss += __shfl_xor_sync(0xffffffff, loss, lanes);
+    if (lane % 32 == 0) atomicAdd(&losses.data[span], double(loss));
+    #else
+    if (loss != 0) losses.data[span] += double(loss);
+    #endif
+""")
+def _add_loss(losses: wp.array(dtype=wp.float64), span: int, lane: int, loss: Any): ...
+
+
 @wp.kernel
 def add_spring_forces(
     # Model:
@@ -57,27 +69,28 @@ def add_spring_forces(
     f: wp.array2d(dtype=Any),
     losses: wp.array(dtype=wp.float64),
 ):
-    """Add the forces of the springs, one thread per spring; launched over (span, lane).
+    """Add the forces of the springs, one thread per spring; launched over (span, MAX_SPAN lanes).
 
     Losses [span_count] gain the power of the dampers times loss_weight.
     """
     index, lane = wp.tid()
     span = spans[index]
-    if lane >= span[2]:
-        return
-    i = span[0] + lane
-    j = span[1] + lane
-    c = classes[span[3]]
-    offset = vectors.load(x, j) - vectors.load(x, i)
-    velocity = vectors.load(v, j) - vectors.load(v, i)
-    force = spring_force(offset, velocity, c[0], c[1], c[2])
-    vectors.add(f, i, force)
-    vectors.add(f, j, -force)
-    wp.atomic_add(losses, index, wp.float64(loss_weight * damping_power(offset, velocity, c[2])))
+    loss = type(loss_weight)(0.0)
+    if lane < span[2]:
+        i = span[0] + lane
+        j = span[1] + lane
+        c = classes[span[3]]
+        offset = vectors.load(x, j) - vectors.load(x, i)
+        velocity = vectors.load(v, j) - vectors.load(v, i)
+        force = spring_force(offset, velocity, c[0], c[1], c[2])
+        vectors.add(f, i, force)
+        vectors.add(f, j, -force)
+        loss = loss_weight * damping_power(offset, velocity, c[2])
+    _add_loss(losses, index, lane, loss)
 
 
-# The same law for a whole span on the CPU, in three passes of vector instructions. One pass would not do, where the two
-# ends may overlap. Within a pass no particle occurs twice, so plain adds do.
+# The same law for a whole span on the CPU, in vector instructions. Where its two ends overlap, the forces on the second
+# ends wait in buffers for a pass of their own, so that within a pass no particle occurs twice and plain adds do.
 @wp.func_native(f"""
     auto law_rest = rest;
     typedef decltype(law_rest) real;
@@ -85,14 +98,14 @@ def add_spring_forces(
     {vectors.ROW}
     {vectors.EACH}
     const real *px = row(x, 0) + i, *py = row(x, 1) + i, *pz = row(x, 2) + i;
-    const real *qx = row(x, 0) + j, *qy = row(x, 1) + j, *qz = row(x, 2) + j;
     const real *pu = row(v, 0) + i, *pv = row(v, 1) + i, *pw = row(v, 2) + i;
-    const real *qu = row(v, 0) + j, *qv = row(v, 1) + j, *qw = row(v, 2) + j;
-    real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}], power[{MAX_SPAN}];
-    for (int k = 0; k < 8; ++k) power[((count - 1) & ~7) + k] = real(0);
-    each(0, count, [&](int s) {{
-        real dx = qx[s] - px[s], dy = qy[s] - py[s], dz = qz[s] - pz[s];
-        real du = qu[s] - pu[s], dv = qv[s] - pv[s], dw = qw[s] - pw[s];
+    real *fx = row(f, 0) + i, *fy = row(f, 1) + i, *fz = row(f, 2) + i;
+    const int d = j - i;
+    real total = real(0);
+    auto law = [&](int s, real& gx, real& gy, real& gz) {{
+        #pragma clang fp contract(fast)
+        real dx = px[s + d] - px[s], dy = py[s + d] - py[s], dz = pz[s + d] - pz[s];
+        real du = pu[s + d] - pu[s], dv = pv[s + d] - pv[s], dw = pw[s + d] - pw[s];
         real square = dx * dx + dy * dy + dz * dz;
         // Only the builtin becomes a vector instruction. The compiler for GPUs, which never run this, does not have it.
         #ifdef __CUDACC__
@@ -103,21 +116,32 @@ def add_spring_forces(
         real inverse = square > real(0) ? real(1) / length : real(0);
         real approach = (du * dx + dv * dy + dw * dz) * inverse;
         real scale = stiffness * (real(1) - rest * inverse) + damping * approach * inverse;
-        gx[s] = scale * dx;
-        gy[s] = scale * dy;
-        gz[s] = scale * dz;
-        power[s] = damping * approach * approach;
-    }});
-    real *fx = row(f, 0) + i, *fy = row(f, 1) + i, *fz = row(f, 2) + i;
-    each(0, count, [&](int s) {{ fx[s] += gx[s]; fy[s] += gy[s]; fz[s] += gz[s]; }});
-    fx += j - i;
-    fy += j - i;
-    fz += j - i;
-    each(0, count, [&](int s) {{ fx[s] -= gx[s]; fy[s] -= gy[s]; fz[s] -= gz[s]; }});
-    // Eight sums at once: a single one would wait for each addition in turn.
-    real sums[8] = {{}};
-    for (int s = 0; s < count; s += 8) for (int k = 0; k < 8; ++k) sums[k] += power[s + k];
-    real total = ((sums[0] + sums[4]) + (sums[1] + sums[5])) + ((sums[2] + sums[6]) + (sums[3] + sums[7]));
+        gx = scale * dx;
+        gy = scale * dy;
+        gz = scale * dz;
+        fx[s] += gx;
+        fy[s] += gy;
+        fz[s] += gz;
+        real power = damping * approach * approach;
+        {{
+            // A sum for each lane: a single one would wait for each addition in turn.
+            #pragma clang fp reassociate(on)
+            total += power;
+        }}
+    }};
+    if (d >= count || -d >= count) {{
+        each(0, count, [&](int s) {{
+            real gx, gy, gz;
+            law(s, gx, gy, gz);
+            fx[s + d] -= gx;
+            fy[s + d] -= gy;
+            fz[s + d] -= gz;
+        }});
+    }} else {{
+        real gx[{MAX_SPAN}], gy[{MAX_SPAN}], gz[{MAX_SPAN}];
+        each(0, count, [&](int s) {{ law(s, gx[s], gy[s], gz[s]); }});
+        each(0, count, [&](int s) {{ fx[s + d] -= gx[s]; fy[s + d] -= gy[s]; fz[s + d] -= gz[s]; }});
+    }}
     losses.data[span] += double(loss_weight * total);
 """)
 def _add_span(

@@ -21,10 +21,12 @@ EACH = """
         const int whole = begin + ((end - begin) & ~7);
         #pragma clang loop vectorize(assume_safety) interleave_count(1)
         for (int i = begin; i < whole; ++i) body(i);
+        const int rest = end - whole;
+        if (rest == 0) return;
         #if defined(__AVX__) || defined(__ARM_FEATURE_SVE)
-        #pragma clang loop vectorize(assume_safety) vectorize_predicate(enable) interleave_count(1)
+        #pragma clang loop vectorize(assume_safety) interleave_count(1)
         #endif
-        for (int i = whole; i < end; ++i) body(i);
+        for (int k = 0; k < 8; ++k) if (k < rest) body(whole + k);
     };
 """
 

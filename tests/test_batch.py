@@ -656,6 +656,22 @@ def test_time_is_estimated_once_for_runs_of_one_structure(base, monkeypatch):
     assert len(forecasts) == 4
 
 
+def test_a_scene_too_large_for_the_memory_leaves_the_others_listed(base, monkeypatch):
+    """Let memory end while one scene is built, where the system allows less than the estimate knows of."""
+    from warpjelly.batch import estimate
+
+    def forecast(scene: Any, **options: Any) -> dict[str, Any]:
+        if scene.bodies[0].particles_per_edge > 4:
+            raise MemoryError
+        return {"seconds": 1.0, "particles": 1, "springs": 1, "memory_bytes": 1}
+
+    monkeypatch.setattr(estimate, "forecast", forecast)
+    sweep = Sweep(base=base, vary={"bodies.cube.particles_per_edge": [3, 5, 4]})
+    problems = [run["problem"] for run in estimate_batch(sweep, workers=1, device="cpu")["runs"]]
+    assert [problem is None for problem in problems] == [True, False, True]
+    assert "out of memory; lower the resolution" in problems[1]
+
+
 def test_the_live_display_shows_the_batch_and_every_worker(base):
     """Tell the display of two runs, and read what is on the terminal."""
     terminal = io.StringIO()

@@ -114,6 +114,27 @@ def test_runs_are_the_scenes_that_load_scene_gives(tmp_path):
         assert entry.scene == load_scene(CUBE, overrides=entry.parameters)
 
 
+def test_a_sweep_expects_what_it_says_instead_of_its_base(tmp_path):
+    """Expect what the sweep names alone, or, where it has no such table, what the base expects."""
+    vary = f'[vary]\n"{STIFFNESS}" = [10, 20]\n'
+    for text, expected in (
+        ("", ["rest_height", "speed", "shape_error", "bounce"]),
+        ("[expect]\nbounce.min = 0.1\n", ["bounce"]),
+        ("[expect]\n", []),
+    ):
+        for entry in read_specs([write_sweep(tmp_path, text + vary)]):
+            assert [key for key, _, _ in entry.scene.expect.items()] == expected
+
+
+def test_frames_and_durations_replace_each_other(tmp_path):
+    """Give the length of runs in the other unit than the base, whose own length it replaces."""
+    vary = f'[vary]\n"{STIFFNESS}" = [10]\n'
+    (entry,) = read_specs([write_sweep(tmp_path, "[set]\nframes = 7\n" + vary)])
+    assert entry.scene.frame_count == 7
+    with pytest.raises(InputError, match="frames"):
+        load_scene(CUBE, overrides={"frames": 7, "duration": 1.0})
+
+
 def test_names_are_made_from_values(tmp_path):
     """Make names by default, by the sweep's own text, and by number where values do not tell runs apart."""
 

@@ -21,7 +21,7 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
     Args:
         path: TOML file, or a jello cube world, .w.
         overrides: values by dotted key, for example ``{"solver.dt": 5e-4, "bodies.0.size": 2.0}``; an entry of a list
-            goes by its number or its name.
+            goes by its number or its name. ``frames`` comes instead of ``duration``, and the other way round.
         frames: number of samples, instead of the scene's frames or duration. What the scene expects of itself goes with
             its own length, and is left out.
 
@@ -35,6 +35,9 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         overrides = settle_time(path, data, overrides)
     else:
         data = read_toml(path)
+    for length, other in (("frames", "duration"), ("duration", "frames")):
+        if length in overrides:
+            data.pop(other, None)
     for key, value in overrides.items():
         try:
             set_key(data, key, value)

@@ -87,6 +87,7 @@ class Simulator:
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
         self.grip = Grip(self.model, self.state, dt=self.dt) if interactive else None
         """A hand to pull particles with."""
+        self._launches: dict[wp.Kernel, wp.Launch] = {}
         with capture_lock:
             self._stepper = Stepper(
                 self.model,
@@ -345,8 +346,14 @@ class Simulator:
     def _copy(rows: wp.array) -> np.ndarray:
         return np.ascontiguousarray(rows.numpy().T)
 
-    def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, int], inputs: list[Any], outputs: list[Any]) -> None:
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
+    def _launch(self, kernel: wp.Kernel, dim: int, inputs: list[Any], outputs: list[Any]) -> None:
+        """Launch a kernel, each time with the same arguments: the launch is recorded, which is quicker to repeat."""
+        if dim == 0:
+            return
+        if kernel not in self._launches:
+            arguments = {"inputs": inputs, "outputs": outputs, "device": self.device}
+            self._launches[kernel] = wp.launch(kernel, dim=dim, record_cmd=True, **arguments)
+        self._launches[kernel].launch()
 
     def _measure_chunks(self) -> np.ndarray:
         """Return the sums over each chunk, float64 [chunk_count, diagnostics.COLUMNS]; a view that is overwritten."""
@@ -373,6 +380,5 @@ class Simulator:
 
     def _frame_blocks(self) -> list[int]:
         """Cut the substeps of a frame into blocks that graphs are captured for, of at most two sizes."""
-        blocks = -(-self.substeps // MAX_CAPTURED_SUBSTEPS)
-        short, longer = divmod(self.substeps, blocks)
-        return [short + 1] * longer + [short] * (blocks - longer)
+        blocks, rest = divmod(self.substeps, MAX_CAPTURED_SUBSTEPS)
+        return [MAX_CAPTURED_SUBSTEPS] * blocks + [rest] * (rest > 0)

@@ -7,7 +7,7 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..errors import WarpjellyError
+from ..errors import WarpjellyError, verdict
 from ..machine import memory_limit, threads_of
 from ..plan import CLIP_FRAMES, plan_scene
 from ..run import forecast
@@ -113,8 +113,9 @@ def estimate(
         if entry.scene is not None:
             try:
                 figures = estimator.forecast(entry.scene, device=device, threads=threads_of(workers))
-            except WarpjellyError as error:
-                problem = f"{entry.source}: {error}"
+            except Exception as error:
+                # Whatever is wrong with one scene, memory too small for it included, is not wrong with the others.
+                problem = f"{entry.source}: {verdict(error)[0]}"
         about = {"name": entry.name, "source": entry.source, "parameters": entry.parameters, "problem": problem}
         runs.append({**about, **figures})
         progress(number, len(entries))

@@ -166,6 +166,9 @@ class Sweep(Table):
         "unless given. {parameter:.3g} says how to write a number",
     )
     set: dict[str, Any] = Field({}, description="by dotted key, what is the same in all runs instead of the base's")
+    expect: dict[str, Any] | None = Field(
+        None, description="what each run expects of itself, as in a scene, instead of what the base expects"
+    )
 
     @field_validator("vary", mode="before")
     @classmethod
@@ -254,7 +257,8 @@ class Sweep(Table):
             given: what was asked for beside the sweep, which comes before ``set``.
         """
         varied = {key: value for name, value in row.items() for key in self.vary[name].keys or [name]}
-        return copy.deepcopy({**self.set, **given, **varied})
+        expected = {} if self.expect is None else {"expect": self.expect}
+        return copy.deepcopy({**expected, **self.set, **given, **varied})
 
 
 def read_sweep(path: Path) -> Sweep:
