@@ -43,7 +43,7 @@ def launch_everything() -> None:
     }
     for precision, integrator in itertools.product(("float32", "float64"), ("rk4", "semi_implicit_euler")):
         solver = {"precision": precision, "integrator": integrator}
-        simulator = Simulator(make_scene(**parts, solver=solver), device="cpu")
+        simulator = Simulator(make_scene(**parts, solver=solver), device="cpu", interactive=True)
         simulator.step()
         simulator.first_lost()
         simulator.diagnostics()

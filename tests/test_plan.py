@@ -153,7 +153,7 @@ def test_bodies_that_are_made_alike_are_made_once(tmp_path: Path, monkeypatch) -
 
     monkeypatch.setattr(plan, "voxelize_model", count)
     together, state = build(plan_scene(Scene.model_validate({**scene, "bodies": bodies})), device="cpu")
-    assert voxelized == ["plain", "finer", "stiff"]
+    assert voxelized == ["plain", "finer"]
     spans, classes, first_class = together.spans.numpy(), together.spring_classes.numpy(), 0
     for part, body in zip(together.bodies, bodies, strict=True):
         alone, start = build(plan_scene(Scene.model_validate({**scene, "bodies": [body]})), device="cpu")

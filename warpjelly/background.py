@@ -31,7 +31,7 @@ class Background:
 
     def submit(self, job: Callable[..., None], *arguments: Any) -> None:
         """Add a job; raises what an earlier one raised."""
-        self._wait(self._most - 1)
+        self._wait(0 if self._failed else self._most - 1)
         self._unfinished.append(self._executor.submit(self._do, job, *arguments))
 
     def join(self) -> None:

@@ -62,7 +62,8 @@ YOUNG_SPANS = 2
 # Springs across the boundary of two materials end spans, too: so many times the spans where a body has several.
 MIXED_SPANS = 1.5
 # Keys of a body that say where it is and what happens to it, not what it is made of.
-PLACEMENT = {"name", "position", "rotation", "velocity", "angular_velocity", "charge", "pinned"}
+PLACEMENT = {"name", "position", "rotation", "velocity", "angular_velocity", "charge", "pinned", "positions"}
+PLACEMENT |= {"velocities"}
 # Resolutions to try where a model has no voxel; the last ones take a second.
 _FINER = [2**k for k in range(2, 11)]
 # A clip of the stage has at most so many frames, and bytes. It is what memory holds, and what a sudden end of the
@@ -152,20 +153,24 @@ def clip_length(point_count: int) -> int:
     return max(1, min(CLIP_FRAMES, CLIP_BYTES // (BYTES_PER_SAMPLE * max(point_count, 1))))
 
 
-def plan_scene(scene: Scene) -> Plan:
+def plan_scene(scene: Scene, known: Plan | None = None) -> Plan:
     """Find out how every body is made and count what follows from it; once for all that are made alike.
+
+    Args:
+        scene: what to plan.
+        known: a plan whose bodies are taken over where they are made alike; their models are not read again.
 
     Raises:
         SceneError: a model cannot be used, or the scene does not fit into memory; the message has the numbers.
     """
     shot = _open_shot(scene)
-    plans: dict[str, BodyPlan] = {}
+    plans = {} if known is None else {_making(plan.body, known.scene): plan for plan in known.bodies}
     bodies = []
     for body in scene.bodies:
-        making = body.model_dump_json(exclude=PLACEMENT)
+        making = _making(body, scene)
         if making not in plans:
             plans[making] = _plan_body(body, scene, shot)
-        bodies.append(replace(plans[making], body=body))
+        bodies.append(_planned_as(plans[making], body))
     plan = Plan(scene, bodies)
     if shot is not None:
         _require_meshes(shot, plan)
@@ -178,6 +183,28 @@ def plan_scene(scene: Scene) -> Plan:
         what += f", '{name}' {share / 1e9:.1f} GB of it,"
     _require_memory(plan.memory_bytes, what)
     return plan
+
+
+def _making(body: AnyBody, scene: Scene) -> str:
+    """Return what the plan of a body depends on but for the names of its materials, as text."""
+    names = _material_names(body)
+    # Which of them are the same says which cells are alike, and the law what has to be known of cells.
+    alike = [(names.index(name), scene.materials[name].law) for name in names]
+    excluded = dict.fromkeys({*PLACEMENT, "material"}, True) | {"regions": {"__all__": {"material"}}}
+    shown = scene.output.surface, sorted(scene.output.show)
+    return f"{body.model_dump_json(exclude=excluded)} {alike} {scene.up_axis} {shown}"
+
+
+def _material_names(body: AnyBody) -> list[str]:
+    """Return the material of a body, and that of each of its regions."""
+    regions = body.regions if isinstance(body, VoxelsBody | ModelBody) else []
+    return [body.material, *(region.material for region in regions)]
+
+
+def _planned_as(plan: BodyPlan, body: AnyBody) -> BodyPlan:
+    """Return the plan of a body that is made like another one, with its own place and names of materials."""
+    names = dict(zip(_material_names(plan.body), _material_names(body), strict=True))
+    return replace(plan, body=body, materials={names[name]: count for name, count in plan.materials.items()})
 
 
 def _open_shot(scene: Scene) -> Shot | None:

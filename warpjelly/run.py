@@ -280,7 +280,7 @@ def _simulate_frames(
                 if due:
                     background.join()
                 changing, copied = _changing_arrays(sim, observer) if due else (None, True)
-                row = _metrics_row(index, sim.time, figures)
+                row = metrics_row(index, sim.time, figures)
                 background.submit(recorder.save, index, sim.shapes(), row, changing)
                 if not copied:
                     background.join()
@@ -380,7 +380,7 @@ def provenance(scene: Scene, sim: Simulator) -> dict[str, Any]:
     }
 
 
-def _metrics_row(index: int, seconds: float, figures: Mapping[str, Any]) -> dict[str, float]:
+def metrics_row(index: int, seconds: float, figures: Mapping[str, Any]) -> dict[str, float]:
     """Return one row of metrics.csv by column name; SI units."""
     row: dict[str, float] = {"frame": index, "time": seconds}
     for name, value in figures.items():

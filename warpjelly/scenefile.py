@@ -39,7 +39,10 @@ def load_scene(path: str | Path, *, overrides: Mapping[str, Any] | None = None, 
         if length in overrides:
             data.pop(other, None)
     for key, value in overrides.items():
-        _override(data, key, value, path)
+        try:
+            set_key(data, key, value)
+        except InputError as error:
+            raise InputError(f"{path}: {error}") from error
     if frames is not None:
         data.pop("duration", None)
         data["frames"] = frames
@@ -59,13 +62,25 @@ def read_scene(data: dict[str, Any], path: Path) -> Scene:
         InputError: as for ``load_scene``.
     """
     try:
-        return Scene.model_validate(data, context={"folder": path.parent})
+        return validate_scene(data, path.parent)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def validate_scene(data: Mapping[str, Any], folder: Path) -> Scene:
+    """Validate the tables of a scene whose relative paths are relative to a folder.
+
+    Raises:
+        InputError: something is wrong with them; the message names the key and the value.
+    """
+    try:
+        return Scene.model_validate(data, context={"folder": folder})
     except ValidationError as error:
         # Here, because it imports this module.
         from .batch.sweep import is_sweep
 
         what = "a sweep, whose runs are done by 'warpjelly batch'" if is_sweep(data) else explain(error, Scene)
-        raise InputError(f"{path}: {what}") from error
+        raise InputError(what) from error
 
 
 def read_toml(path: Path) -> dict[str, Any]:
@@ -90,27 +105,35 @@ def read_toml(path: Path) -> dict[str, Any]:
         raise InputError(f"{path}: cannot read the scene: {error.strerror}{hint}") from error
 
 
-def _override(data: dict[str, Any], key: str, value: Any, path: Path) -> None:
-    """Set a dotted key in nested tables and lists, making tables on the way."""
+def set_key(data: dict[str, Any], key: str, value: Any) -> None:
+    """Set a dotted key in the tables of a scene, making tables on the way; see ``load_scene``.
+
+    Raises:
+        InputError: the key leads nowhere.
+    """
     *parents, last = key.split(".")
     node: Any = data
     for part in parents:
         if isinstance(node, list):
-            node = node[_entry(node, part, f"{path}: {key}")]
+            node = node[entry_of(node, part, key)]
         elif isinstance(node, dict):
             node = node.setdefault(part, {})
         else:
-            raise InputError(f"{path}: {key}: '{part}' is inside a value that is not a table")
+            raise InputError(f"{key}: '{part}' is inside a value that is not a table")
     if isinstance(node, list):
-        node[_entry(node, last, f"{path}: {key}")] = value
+        node[entry_of(node, last, key)] = value
     elif isinstance(node, dict):
         node[last] = value
     else:
-        raise InputError(f"{path}: {key}: '{last}' is inside a value that is not a table")
+        raise InputError(f"{key}: '{last}' is inside a value that is not a table")
 
 
-def _entry(entries: list[Any], part: str, what: str) -> int:
-    """Return the position of a list entry given by its number or its name, also one that it gets for having none."""
+def entry_of(entries: list[Any], part: str, key: str) -> int:
+    """Return the position of a list entry given by its number or its name, also one that it gets for having none.
+
+    Raises:
+        InputError: there is none; the message names the key that asks for it.
+    """
     names = [
         entry.get("name", f"{entry.get('type')}_{i}") if isinstance(entry, dict) else None
         for i, entry in enumerate(entries)
@@ -120,7 +143,7 @@ def _entry(entries: list[Any], part: str, what: str) -> int:
     if part in (numbers := [str(i) for i in range(len(entries))]):
         return numbers.index(part)
     known = [" to ".join(dict.fromkeys(numbers[:1] + numbers[-1:])), *names]
-    raise InputError(f"{what}: no entry '{part}'; entries: {', '.join(filter(None, known)) or 'none'}")
+    raise InputError(f"{key}: no entry '{part}'; entries: {', '.join(filter(None, known)) or 'none'}")
 
 
 def identifier(text: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import logging
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from warpjelly.kernels import diagnostics, shapes
 
 from .device import choose_device
 from .errors import DivergedError, SceneError
+from .grip import Grip
 from .machine import available_cores
 from .model import Model, State, build
 from .plan import Plan, plan_scene
@@ -34,6 +36,9 @@ from .stepping import MAX_CAPTURED_SUBSTEPS, Stepper, capture_lock
 
 steps = logging.getLogger("warpjelly.steps")
 
+# Substeps beyond whole frames are replayed so many at a time: few enough to capture at once, when they are asked for.
+REST_BLOCK = 8
+
 
 class Simulator:
     """A scene in motion.
@@ -42,13 +47,16 @@ class Simulator:
         scene: what to simulate, or its plan.
         device: "auto", "cpu", "cuda:0" ...
         threads: how many may be used on the CPU, None for one per core; results do not depend on it.
+        interactive: whether there is a ``grip``, a hand to pull with.
 
     Raises:
         InputError: the scene cannot be built (SceneError), or there is no such device.
         ValueError: threads is less than 1.
     """
 
-    def __init__(self, scene: Scene | Plan, *, device: str = "auto", threads: int | None = None) -> None:
+    def __init__(
+        self, scene: Scene | Plan, *, device: str = "auto", threads: int | None = None, interactive: bool = False
+    ) -> None:
         if threads is not None and threads < 1:
             raise ValueError(f"cannot simulate with {threads} threads")
         plan = scene if isinstance(scene, Plan) else plan_scene(scene)
@@ -58,6 +66,8 @@ class Simulator:
         self.state: State
         with capture_lock:
             self.model, self.state = build(plan, device=self.device)
+            # Where the limits may be asked for later.
+            self._rest = wp.clone(self.state.x) if interactive else None
         self.substep_count = 0
         """Substeps since the start."""
         self._limits: tuple[dict[str, float | None], dict[str, float | None]] | None = None
@@ -75,6 +85,8 @@ class Simulator:
             self._normals = wp.zeros(int(self._normal_start[-1]), dtype=wp.vec3f)
             self._velocities = wp.zeros(point_count, dtype=wp.vec3f)
             self._magnitudes = wp.zeros(point_count, dtype=wp.float32)
+        self.grip = Grip(self.model, self.state, dt=self.dt) if interactive else None
+        """A hand to pull particles with."""
         self._launches: dict[wp.Kernel, wp.Launch] = {}
         with capture_lock:
             self._stepper = Stepper(
@@ -84,6 +96,7 @@ class Simulator:
                 dt=self.dt,
                 culling=self.scene.solver.culling,
                 threads=available_cores() if threads is None else threads,
+                grip=self.grip,
             )
 
     @property
@@ -140,8 +153,9 @@ class Simulator:
         if count < 0:
             raise ValueError(f"cannot step back by {-count} substeps")
         frames, rest = divmod(count, self.substeps)
+        blocks, single = divmod(rest, REST_BLOCK)
         try:
-            for substeps in self._frame_blocks() * frames + [1] * rest:
+            for substeps in self._frame_blocks() * frames + [REST_BLOCK] * blocks + [1] * single:
                 self._stepper.step(substeps)
         except KeyboardInterrupt:
             # Some blocks were done.
@@ -156,6 +170,14 @@ class Simulator:
             DivergedError: a position or velocity is not finite any more, or absurd.
         """
         self.step(self.substeps)
+        self.require_sane()
+
+    def require_sane(self) -> None:
+        """Make sure that every particle is at a sane place and speed.
+
+        Raises:
+            DivergedError: a position or velocity is not finite any more, or absurd.
+        """
         if (particle := self.first_lost()) is not None:
             body = next(body for body in self.model.bodies if particle < body.particles.stop)
             # The limits belong to rest, which is lost: they are named if they were asked for before.
@@ -167,6 +189,10 @@ class Simulator:
                 "of a collider"
             )
 
+    def update_forces(self) -> None:
+        """Evaluate the forces of the current state anew, after it was changed by hand; nothing else changes."""
+        self._stepper.add_forces(loss_weight=0.0)
+
     def first_lost(self) -> int | None:
         """Return the smallest index of a particle that is not at a sane place and speed, None if all are."""
         self._lost.fill_(self.model.particle_count)
@@ -174,19 +200,21 @@ class Simulator:
         first = int(self._lost.numpy()[0])
         return first if first < self.model.particle_count else None
 
-    def step_limits(self, *, contacts: bool) -> dict[str, float | None]:
+    def step_limits(self, *, contacts: bool, wanted: Callable[[], None] = lambda: None) -> dict[str, float | None]:
         """Return the largest stable step of each integrator, s; None where it has none.
 
-        Belongs to small motions about time zero, so it is to be asked for the first time before the first step.
+        Belongs to small motions about time zero, so it is to be asked for the first time before the first step, unless
+        the simulator is interactive: then at any time, also in another thread than that which steps.
 
         Args:
             contacts: as if each particle touched the worst collider, which is a safe bound; else the springs alone.
+            wanted: called now and then; raises something where the limits are not wanted any more.
         """
         if self._limits is None:
-            if self.substep_count > 0:
+            if self.substep_count > 0 and self._rest is None:
                 raise RuntimeError("ask for the limits before the first step: they belong to the state at time zero")
             steps.info("finding the largest stable step")
-            pairs = bound_spring_pairs(self.model, self.state.x)
+            pairs = bound_spring_pairs(self.model, self.state.x if self._rest is None else self._rest, wanted)
             self._limits = step_limits(pairs), step_limits(add_contacts(pairs, self._contact_pairs))
         return self._limits[contacts]
 

@@ -24,7 +24,7 @@ from warpjelly.kernels.turns import Turn
 from .memory import LIMIT_EVALUATIONS
 from .model import Model
 from .placing import BLOCK
-from .stepping import launch_spring_forces
+from .stepping import capture_lock, launch_spring_forces
 
 INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
 # Share of the limit that dt = "auto" takes. Away from rest springs turn and stretch, and the limit is lower: undamped
@@ -104,18 +104,21 @@ def _runge_kutta_limit(edges: np.ndarray, coefficients: tuple[float, ...]) -> fl
     return float(low.min())
 
 
-def bound_spring_pairs(model: Model, x: wp.array) -> np.ndarray:
+def bound_spring_pairs(model: Model, x: wp.array, wanted: Callable[[], None] = lambda: None) -> np.ndarray:
     """Return a convex polygon around the pairs (a, d) of the springs, [vertex_count, 2], 1/s^2 and 1/s.
+
+    Other threads may simulate, and capture graphs, meanwhile.
 
     Args:
         model: the springs and masses.
         x: positions at rest, real [3, particle_count], m.
+        wanted: called now and then; raises something where the limits are not wanted any more.
     """
     ratios = _ratios(model)
     if len(ratios) == 0:
         return np.zeros((1, 2))
     least, greatest = ratios.min(), ratios.max()
-    top_eigenvalue = _eigenvalue_solver(model, x)
+    top_eigenvalue = _eigenvalue_solver(model, x, wanted)
     if math.isinf(least):
         return np.array([[0.0, 0.0], [0.0, top_eigenvalue(0.0, 1.0)]])
     if _are_equal(ratios):
@@ -306,16 +309,17 @@ def _hull(points: np.ndarray) -> np.ndarray:
     return np.array(chains[0] + chains[1])
 
 
-def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], float]:
+def _eigenvalue_solver(model: Model, x: wp.array, wanted: Callable[[], None]) -> Callable[[float, float], float]:
     """Return a function (p, q) -> top eigenvalue of p A + q B.
 
     The force kernel itself applies the matrices: at rest, with velocities w and (rest length, 0, p k + q d) for (rest
     length, stiffness, damping), it gives -(p K + q D) w.
     """
     device = x.device
-    v, f = wp.zeros_like(x), wp.zeros_like(x)
-    losses = wp.zeros(len(model.spans), dtype=wp.float64, device=device)
-    phases = [(Turn(), wp.array([[0, len(model.spans)]], dtype=wp.vec2i, device=device))]
+    with capture_lock:
+        v, f = wp.zeros_like(x), wp.zeros_like(x)
+        losses = wp.zeros(len(model.spans), dtype=wp.float64, device=device)
+        phases = [(Turn(), wp.array([[0, len(model.spans)]], dtype=wp.vec2i, device=device))]
     classes = model.spring_classes.numpy().astype(float)
     root = np.sqrt(model.particle_inv_mass.numpy())
     # Row by row, here and below: of a large model temporaries of whole arrays would double what it takes.
@@ -326,14 +330,17 @@ def _eigenvalue_solver(model: Model, x: wp.array) -> Callable[[float, float], fl
 
     def top_eigenvalue(p: float, q: float) -> float:
         constants = np.stack([classes[:, 0], 0.0 * classes[:, 0], p * classes[:, 1] + q * classes[:, 2]], axis=1)
-        table = wp.array(constants, dtype=model.spring_classes.dtype, device=device)
+        with capture_lock:
+            table = wp.array(constants, dtype=model.spring_classes.dtype, device=device)
 
         def multiply(vector: np.ndarray) -> np.ndarray:
-            for number, row in enumerate(vector):
-                v[number].assign(root * row)
-            f.zero_()
-            launch_spring_forces(model, table, x, v, f, phases=phases, loss_weight=0.0, losses=losses)
-            product = f.numpy()
+            wanted()
+            with capture_lock:
+                for number, row in enumerate(vector):
+                    v[number].assign(root * row)
+                f.zero_()
+                launch_spring_forces(model, table, x, v, f, phases=phases, loss_weight=0.0, losses=losses)
+                product = f.numpy()
             product *= -root
             return product
 

@@ -9,8 +9,9 @@ from typing import Any
 
 import warp as wp
 
-from warpjelly.kernels import bounds, contacts, fields, integrators, springs, turns
+from warpjelly.kernels import bounds, contacts, fields, grips, integrators, springs, turns
 
+from .grip import Grip
 from .model import CHUNK_SIZE, Model, State, zero_rows
 from .parts import find_parts
 from .softcontact import SoftContact
@@ -71,10 +72,22 @@ class Stepper:
         dt: the time step, s.
         culling: look for contact only where bounding boxes meet; results are the same.
         threads: how many there may be on the CPU; results are the same.
+        grip: a hand that may pull; without one nothing is launched for it.
     """
 
-    def __init__(self, model: Model, state: State, *, integrator: str, dt: float, culling: bool, threads: int) -> None:
+    def __init__(
+        self,
+        model: Model,
+        state: State,
+        *,
+        integrator: str,
+        dt: float,
+        culling: bool,
+        threads: int,
+        grip: Grip | None = None,
+    ) -> None:
         self._model = model
+        self._grip = grip
         self._state = state
         self._dt = dt
         self._culling = culling
@@ -192,6 +205,9 @@ class Stepper:
             loss_weight=loss_weight,
             losses=state.spring_losses,
         )
+        if (grip := self._grip) is not None:
+            held = [grip.count, grip.particles, grip.stiffness, grip.damping, grip.places]
+            self._launch(grips.add_grip_forces, self._lanes, [self._lanes, *held, state.x, state.v], [state.f])
         has_colliders = len(model.colliders.kind) > 0
         boxes = [self._lower, self._upper]
         if (self.soft is not None and self.soft.culls) or (has_colliders and self._culling):
