@@ -62,8 +62,10 @@ YOUNG_SPANS = 2
 # Springs across the boundary of two materials end spans, too: so many times the spans where a body has several.
 MIXED_SPANS = 1.5
 # Keys of a body that say where it is and what happens to it, not what it is made of.
-PLACEMENT = {"name", "position", "rotation", "velocity", "angular_velocity", "charge", "pinned", "positions"}
-PLACEMENT |= {"velocities"}
+PLACEMENT = {
+    *("name", "position", "rotation", "velocity", "angular_velocity"),
+    *("charge", "pinned", "positions", "velocities"),
+}
 # Resolutions to try where a model has no voxel; the last ones take a second.
 _FINER = [2**k for k in range(2, 11)]
 # A clip of the stage has at most so many frames, and bytes. It is what memory holds, and what a sudden end of the

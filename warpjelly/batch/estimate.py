@@ -9,14 +9,13 @@ from typing import Any
 
 from ..errors import WarpjellyError, verdict
 from ..machine import memory_limit, threads_of
-from ..plan import CLIP_FRAMES, plan_scene
+from ..plan import CLIP_FRAMES, PLACEMENT, plan_scene
 from ..run import forecast
 from ..scene import Scene
 from .specs import Entry
 
 # What has no say in how much memory a scene takes, nor, but for contacts, in how long a substep does.
 _FREE = {"name", "duration", "frames", "fps", "gravity", "contact", "expect"}
-_FREE_OF_BODIES = {"position", "rotation", "velocity", "angular_velocity", "charge"}
 
 
 class Estimator:
@@ -74,16 +73,14 @@ def _substeps(scene: Scene) -> float:
 def _structure(scene: Scene) -> str:
     """Return what two scenes have in common that differ in numbers only."""
     data = scene.model_dump(mode="json", exclude=_FREE)
-    for body in data["bodies"]:
-        for key in _FREE_OF_BODIES:
-            body.pop(key)
+    data["bodies"] = [{key: body[key] for key in body.keys() - PLACEMENT} for body in data["bodies"]]
     data["materials"] = {name: material["law"] for name, material in data["materials"].items()}
     data["colliders"] = [collider["type"] for collider in data["colliders"]]
     data["fields"] = [field["type"] for field in data["fields"]]
     data["soft_contact"] = data["soft_contact"]["mode"]
     for key in ("dt", "steps_per_frame"):
         data["solver"].pop(key)
-    return json.dumps(data)
+    return json.dumps(data, sort_keys=True)
 
 
 def estimate(
