@@ -11,7 +11,7 @@ import signal
 import sys
 import tomllib
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -631,6 +631,49 @@ def bench(
 
 
 @app.command()
+def gui(
+    scene: Annotated[
+        Path | None,
+        typer.Argument(
+            help="Scene file to begin with, or folder to choose from; a cube over a floor unless given.",
+            show_default=False,
+        ),
+    ] = None,
+    output: Annotated[
+        Path,
+        typer.Option("-o", "--output", help="Folder for what the page saves: scenes, runs, models sent by browsers."),
+    ] = Path("outputs/gui"),
+    device: DeviceOption = "auto",
+    host: Annotated[
+        str, typer.Option(help="Address to listen at; 0.0.0.0 lets in whoever can reach this machine, unasked.")
+    ] = "127.0.0.1",
+    port: Annotated[
+        int | None,
+        typer.Option(min=1, max=65535, help="8080 if it is free, or any, unless given.", show_default=False),
+    ] = None,
+    settings: SetOption = [],  # noqa: B006
+    open_page: Annotated[bool, typer.Option("--open/--no-open", help="Open the page in a browser here.")] = True,
+) -> None:
+    """Experiment with a scene in a browser: play, pull, change, record.
+
+    The address of the page is printed; any number of browsers may watch, and closing them loses nothing. Ctrl-C ends
+    it.
+    """
+    from .gui.server import require_viser, serve
+
+    require_viser()
+    found = Path("scenes")
+    if scene is not None:
+        found = scene if scene.is_dir() else scene.parent
+    if settings and (scene is None or scene.is_dir()):
+        raise InputError("--set changes keys of a scene: name its file")
+    loaded = None if scene is None or scene.is_dir() else _load(scene, _overrides(settings), None)
+    with _named(scene) if loaded is not None and scene is not None else nullcontext():
+        serve(loaded, device=device, host=host, port=port, scenes=found, folder=output, open_page=open_page)
+    raise typer.Exit(INTERRUPTED)
+
+
+@app.command()
 def doctor() -> None:
     """Show versions, devices, and which optional parts are present."""
     import platform
@@ -658,6 +701,7 @@ def doctor() -> None:
         ("formats", ["lxml", "networkx", "collada"]),
         ("bench", ["newton", "numba", "taichi"]),
         ("cluster", ["ray"]),
+        ("gui", ["viser"]),
     ]:
         missing = "" if all(map(util.find_spec, modules)) else f"missing: pip install 'warpjelly[{extra}]'"
         print(f"  {extra:<10} {missing or 'present'}")

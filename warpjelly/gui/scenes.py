@@ -1,0 +1,117 @@
+"""The tab of files: scenes to open and save, runs to record, pictures to take."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..scenefile import identifier
+from ..worldfile import SUFFIX
+from .controls import Controls, Panel, note
+from .session import Session
+from .snapshot import Snapshot
+
+# For how long a browser may draw a picture, s.
+_PATIENCE = 30.0
+
+
+class ScenesPanel(Panel):
+    """Controls of files.
+
+    Args:
+        controls: what makes them.
+        session: whose set-up is opened, saved and recorded.
+        scenes: folder with scenes to open.
+        folder: where scenes and runs are written to.
+        opened: called when a scene was opened.
+    """
+
+    def __init__(
+        self, controls: Controls, session: Session, scenes: Path, folder: Path, opened: Callable[[], None]
+    ) -> None:
+        self._session, self._scenes, self._folder, self._opened = session, scenes, folder, opened
+        name = session.scene.name
+        with controls.folder("Open"):
+            self._found = controls.gui.add_dropdown("Scene", ("",), hint=f"In {scenes} and {folder}")
+            controls.button("Open", lambda _: self._open(), hint="Instead of all that is here", icon="folder-open")
+        with controls.folder("Save"):
+            self._name = controls.text("Name", hint=f"Of a file in {folder}; `warpjelly run` reproduces it", at=name)
+            controls.button(
+                "Save the scene", self._save, hint="As it is set up now, at time zero", icon="device-floppy"
+            )
+        with controls.folder("Record"):
+            self._run = controls.text("Run", hint=f"Name of a folder in {folder}, with a USD stage", at=f"{name}_run")
+            self._record = controls.button(
+                "Record", self._toggle, hint="Write a USD stage from here on", icon="player-record", color="red"
+            )
+            self._recorded = controls.gui.add_html("")
+        self._replace = controls.gui.add_checkbox("Replace", False, hint="What is there already, of the same name")
+        controls.button("Take a picture", self._take_picture, hint="A PNG, as large as the view", icon="camera")
+        self._list()
+
+    def follow(self, snapshot: Snapshot) -> None:
+        """Show how the recording goes."""
+        going = snapshot.recording
+        self._record.label = "Record" if going is None else "Stop recording"
+        self._record.icon = "player-record" if going is None else "player-stop"
+        self._recorded.content = "" if going is None else note(f"{going.frames} frames in {going.folder}")
+
+    def refresh(self, snapshot: Snapshot) -> None:
+        """Show what there is to open."""
+        self._list()
+
+    def _list(self) -> None:
+        """List scenes to open, by their paths in the folders."""
+        names = tuple(self._files())
+        if names and self._found.options != names:
+            self._found.options = names
+
+    def _files(self) -> dict[str, Path]:
+        folders = dict.fromkeys((self._scenes, self._folder))
+        found = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
+        return {str(path): path for path in found if path.suffix.lower() in (".toml", SUFFIX) and path.is_file()}
+
+    def _open(self) -> None:
+        path = self._files().get(self._found.value)
+        if path is None:
+            raise InputError(f"no scene to open in {self._scenes} or {self._folder}")
+        self._session.open(path)
+        self._session.settle()
+        self._opened()
+
+    def _save(self, client: Any) -> None:
+        path = self._folder / f"{self._identifier(self._name.value)}.toml"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        self._session.save(path, force=self._replace.value)
+        self._list()
+
+    def _toggle(self, client: Any) -> None:
+        if self._session.latest().recording is not None:
+            self._session.stop_recording()
+        else:
+            self._session.record(self._folder / self._identifier(self._run.value), force=self._replace.value)
+
+    @staticmethod
+    def _identifier(name: str) -> str:
+        """Return the name of a file, which leads to no other folder."""
+        if identifier(name) != name:
+            raise InputError(f"{name!r}: a name has letters, digits and _, and does not start with a digit")
+        return name
+
+    def _take_picture(self, client: Any) -> None:
+        import imageio.v3
+
+        camera = client.camera
+        width, height = camera.image_width, camera.image_height
+        try:
+            picture = client.get_render(height, width, transport_format="png", timeout=_PATIENCE)
+        except (TimeoutError, RuntimeError) as error:
+            raise InputError(f"the browser gave no picture: {error}") from error
+        content = io.BytesIO()
+        imageio.v3.imwrite(content, np.ascontiguousarray(picture), extension=".png")
+        client.send_file_download(f"{self._session.scene.name}.png", content.getvalue(), save_immediately=True)
