@@ -176,6 +176,30 @@ def test_colours_are_meshes_that_share_all_triangles() -> None:
     assert len(surface._meshes) == 1
 
 
+def test_what_was_just_added_is_not_yet_in_a_snapshot(tmp_path) -> None:
+    """Draw a snapshot of before something was added: it is chosen, and shown as soon as it is there."""
+    with (
+        Session(device="cpu") as session,
+        served(session, scenes=tmp_path, folder=tmp_path) as (page, _),
+    ):
+        old = session.latest()
+        page.bodies._set_moving(True)
+        page.objects._set_moving(True)
+        page.bodies._add_or_delete(None, "Add")
+        page.objects._create(None, "Sphere")
+        for panel in (page.bodies, page.objects):
+            panel.refresh(old)
+            panel.draw(old)
+            panel.follow(old)
+        assert (page.bodies.chosen, page.objects.chosen) == (session.scene.bodies[-1].name, "sphere")
+        new = session.settle()
+        for panel in (page.bodies, page.objects):
+            panel.refresh(new)
+            panel.draw(new)
+        assert (page.bodies._which.value, page.objects._which.value) == (page.bodies.chosen, page.objects.chosen)
+        assert page.failure is None
+
+
 def test_edges_and_balls_are_drawn_once() -> None:
     """Draw each edge of the faces of a cube once, and no more balls than a browser draws in time."""
     shape, frame = a_surface()
