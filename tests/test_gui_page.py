@@ -28,9 +28,9 @@ from warpjelly.stage.validate import stage_problems
 pytestmark = pytest.mark.browser
 
 MODELS = Path(__file__).parent.parent / "scenes" / "models"
-SIZE = {"width": 1160, "height": 420}
+SIZE = {"width": 1540, "height": 420}
 # Messages are left of the view and the panel is right of it, pixels.
-LEFT, RIGHT = 315, 755
+LEFT, RIGHT = 315, 835
 # A machine that does other things, too, draws some frames per second.
 PATIENCE = 60.0
 SPRINGS = {kind: {"stiffness": 100.0, "damping": 0.05} for kind in ("structural", "shear", "bend")}
