@@ -38,7 +38,8 @@ class ScenesPanel(Panel):
         name = session.scene.name
         with controls.folder("Open"):
             self._found = controls.gui.add_dropdown("Scene", ("",), hint=f"In {scenes} and {folder}")
-            controls.button("Open", lambda _: self._open(), hint="Instead of all that is here", icon="folder-open")
+            controls.button("Open", self._open, hint="Instead of all that is here", icon="folder-open")
+            self._missing = controls.gui.add_html("")
         with controls.folder("Save"):
             self._name = controls.text("Name", hint=f"Of a file in {folder}; `warpjelly run` reproduces it", at=name)
             controls.button(
@@ -68,6 +69,8 @@ class ScenesPanel(Panel):
     def _list(self) -> None:
         """List scenes to open, by their paths in the folders."""
         names = tuple(self._files())
+        where = " or ".join(dict.fromkeys(map(str, (self._scenes, self._folder))))
+        self._missing.content = "" if names else note(f"no scene in {where}; save one, or start where some are")
         if names and self._found.options != names:
             self._found.options = names
 
@@ -76,13 +79,24 @@ class ScenesPanel(Panel):
         found = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
         return {str(path): path for path in found if path.suffix.lower() in (".toml", SUFFIX) and path.is_file()}
 
-    def _open(self) -> None:
+    def _open(self, client: Any) -> None:
         path = self._files().get(self._found.value)
         if path is None:
             raise InputError(f"no scene to open in {self._scenes} or {self._folder}")
-        self._session.open(path)
-        self._session.settle()
+        # Of a large scene it takes a while.
+        telling = client.add_notification("Opening", str(path), loading=True, with_close_button=False)
+        try:
+            self._session.open(path)
+            self._session.settle()
+        finally:
+            telling.remove()
+        self._name_after_scene()
         self._opened()
+
+    def _name_after_scene(self) -> None:
+        """Suggest to save and record the scene under its name."""
+        name = self._session.scene.name
+        self._name.value, self._run.value = name, f"{name}_run"
 
     def _save(self, client: Any) -> None:
         path = self._folder / f"{self._identifier(self._name.value)}.toml"
