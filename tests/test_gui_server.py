@@ -24,6 +24,7 @@ from warpjelly.gui.objects import angles_of, normal_of
 from warpjelly.gui.requests import Requests
 from warpjelly.gui.server import LOCAL, served
 from warpjelly.gui.session import Session
+from warpjelly.gui.surroundings import FIELD_OF_VIEW, PRESETS, look
 from warpjelly.polygons import triangulate
 from warpjelly.shapes import PARTICLES, Shape
 
@@ -199,6 +200,34 @@ def test_what_was_just_added_is_not_yet_in_a_snapshot(tmp_path) -> None:
             panel.draw(new)
         assert (page.bodies._which.value, page.objects._which.value) == (page.bodies.chosen, page.objects.chosen)
         assert page.failure is None
+
+
+def test_an_empty_list_of_scenes_says_why(tmp_path) -> None:
+    """Find no scene to open: the page says where it looked, until there is one."""
+    with (
+        Session(device="cpu") as session,
+        served(session, scenes=tmp_path / "scenes", folder=tmp_path) as (page, _),
+    ):
+        assert str(tmp_path / "scenes") in page.scenes._missing.content
+        session.save(tmp_path / "one.toml")
+        page.scenes.refresh(session.settle())
+        assert page.scenes._missing.content == ""
+        assert page.scenes._found.options == (str(tmp_path / "one.toml"),)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 16 / 9, 3.0])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_camera_sees_all_in_windows_of_any_width(preset, aspect) -> None:
+    """Look at the corners of a box: each is within the field of view, whose height is given, on all sides."""
+    corners = np.array(list(np.ndindex(2, 2, 2))) * [2.0, 1.0, 1.5] + [3.0, 0.5, -1.0]
+    position, target = look(preset, "Y", corners, aspect)
+    backward = (position - target) / np.linalg.norm(position - target)
+    right = np.cross([0.0, 1.0, 0.0], backward)
+    right /= np.linalg.norm(right)
+    x, y, z = np.stack([right, np.cross(backward, right), backward]) @ (corners - position).T
+    slope = np.tan(FIELD_OF_VIEW / 2)
+    assert np.all(np.abs(y) < -slope * z)
+    assert np.all(np.abs(x) < -slope * aspect * z)
 
 
 def test_edges_and_balls_are_drawn_once() -> None:

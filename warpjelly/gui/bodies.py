@@ -118,7 +118,9 @@ class BodiesPanel(Panel):
         self._controls.offer(self._which, names, self._shown_body)
         kinds = tuple(dict.fromkeys(("cube", "voxels", "model", body.type)))
         self._controls.offer(self._kind, kinds, body.type)
-        self._shape.show((body.type,), lambda: self._make_shape(body), snapshot)
+        # Models at hand may be others when a model was uploaded.
+        file = body.file if isinstance(body, ModelBody) else None
+        self._shape.show((body.type, file), lambda: self._make_shape(body), snapshot)
         material = scene.materials[body.material]
         kind = (material.law, material.density is not None)
         self._material.show(kind, lambda: self._make_material(*kind), snapshot)

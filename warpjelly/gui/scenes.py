@@ -100,6 +100,7 @@ class ScenesPanel(Panel):
 
     def _save(self, client: Any) -> None:
         path = self._folder / f"{self._identifier(self._name.value)}.toml"
+        self._require_new(path)
         self._folder.mkdir(parents=True, exist_ok=True)
         self._session.save(path, force=self._replace.value)
         self._list()
@@ -108,7 +109,14 @@ class ScenesPanel(Panel):
         if self._session.latest().recording is not None:
             self._session.stop_recording()
         else:
-            self._session.record(self._folder / self._identifier(self._run.value), force=self._replace.value)
+            folder = self._folder / self._identifier(self._run.value)
+            self._require_new(folder)
+            self._session.record(folder, force=self._replace.value)
+
+    def _require_new(self, path: Path) -> None:
+        """Refuse what is there already, in words of the page."""
+        if path.exists() and not self._replace.value:
+            raise InputError(f"{path}: there already; choose another name, or tick Replace")
 
     @staticmethod
     def _identifier(name: str) -> str:
