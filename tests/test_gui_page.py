@@ -28,9 +28,9 @@ from warpjelly.stage.validate import stage_problems
 pytestmark = pytest.mark.browser
 
 MODELS = Path(__file__).parent.parent / "scenes" / "models"
-SIZE = {"width": 1160, "height": 420}
+SIZE = {"width": 1540, "height": 420}
 # Messages are left of the view and the panel is right of it, pixels.
-LEFT, RIGHT = 315, 755
+LEFT, RIGHT = 315, 835
 # A machine that does other things, too, draws some frames per second.
 PATIENCE = 60.0
 SPRINGS = {kind: {"stiffness": 100.0, "damping": 0.05} for kind in ("structural", "shear", "bend")}
@@ -359,6 +359,10 @@ def test_a_model_is_uploaded(gui, tmp_path) -> None:
     wait(lambda: gui.tab.get_by_label("Model", exact=True).input_value() == "tree.obj", "its name")
     gui.tab.get_by_label("Extent, m", exact=True).wait_for()
     see(gui.tab, lambda seen: 800 < jelly(seen).sum() < 50_000, "a tree")
+    other = tmp_path / "bush.obj"
+    other.write_bytes((MODELS / "tree.obj").read_bytes())
+    chooser.set_input_files(other)
+    wait(lambda: gui.tab.get_by_label("Model", exact=True).input_value() == "bush.obj", "the name of the next")
 
 
 def test_colours_show_forces_or_not(gui) -> None:
@@ -423,7 +427,7 @@ def test_a_saved_scene_reproduces_the_run(gui) -> None:
     np.testing.assert_array_equal(again.shapes()[0].points, here.frames[0].points)
     # It can be opened, and is not replaced unasked.
     press(gui.tab, "Save the scene")
-    gui.tab.get_by_text("there already").first.wait_for()
+    gui.tab.get_by_text("there already; choose another name, or tick Replace").first.wait_for()
 
 
 def test_a_run_is_recorded(gui) -> None:
@@ -463,6 +467,8 @@ def test_a_scene_is_opened(gui) -> None:
     wait(lambda: gui.session.latest().scene.name == "two_cubes", "two cubes")
     assert gui.session.latest().time == 0.0
     see(gui.tab, lambda seen: jelly(seen).sum() > 3000, "cubes")
+    wait(lambda: field(gui.tab, "Name").input_value() == "two_cubes", "its name to save it by")
+    assert field(gui.tab, "Run").input_value() == "two_cubes_run"
 
 
 def test_tabs_show_the_same(gui) -> None:

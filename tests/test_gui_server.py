@@ -24,6 +24,7 @@ from warpjelly.gui.objects import angles_of, normal_of
 from warpjelly.gui.requests import Requests
 from warpjelly.gui.server import LOCAL, served
 from warpjelly.gui.session import Session
+from warpjelly.gui.surroundings import FIELD_OF_VIEW, PRESETS, look
 from warpjelly.polygons import triangulate
 from warpjelly.shapes import PARTICLES, Shape
 
@@ -146,7 +147,7 @@ def a_surface() -> tuple[Shape, Any]:
 
 
 def test_colours_are_meshes_that_share_all_triangles() -> None:
-    """Find each triangle once, in the mesh of the step that the mean force at its corners falls into."""
+    """Find each triangle once, in the mesh of the step that the mean force at the corners of its face falls into."""
     shape, frame = a_surface()
     forces = np.linspace(0.0, 1.0, len(frame.points), dtype=np.float32)
     frame = type(frame)(frame.points, frame.normals, frame.velocities, forces)
@@ -155,15 +156,16 @@ def test_colours_are_meshes_that_share_all_triangles() -> None:
     meshes = surface._meshes
     assert len(meshes) == STEPS
     drawn = [mesh.vertices[mesh.faces] for mesh in meshes]
-    triangles = triangulate(frame.points, shape.counts, shape.corners)[0]
+    triangles, faces = triangulate(frame.points, shape.counts, shape.corners)
+    face_means = [np.mean(forces[corners]) for corners in np.split(shape.corners, np.cumsum(shape.counts)[:-1])]
     # Indices into the table are rounded, by half of one at most.
     tolerance = 0.5 / 255 + 1.0 / 256
     for step, corners in enumerate(drawn):
         for triangle in corners if np.ptp(corners) > 0 else []:
             where = [np.flatnonzero((frame.points == corner).all(axis=1)) for corner in triangle]
             means = [
-                np.mean(forces[list(each)])
-                for each in triangles
+                face_means[face]
+                for each, face in zip(triangles, faces, strict=True)
                 if all(a in b for a, b in zip(each, where, strict=True))
             ]
             assert any(step / STEPS - tolerance <= mean <= (step + 1) / STEPS + tolerance for mean in means)
@@ -174,6 +176,58 @@ def test_colours_are_meshes_that_share_all_triangles() -> None:
     surface.show(frame, None)
     assert all(mesh.removed for mesh in meshes)
     assert len(surface._meshes) == 1
+
+
+def test_what_was_just_added_is_not_yet_in_a_snapshot(tmp_path) -> None:
+    """Draw a snapshot of before something was added: it is chosen, and shown as soon as it is there."""
+    with (
+        Session(device="cpu") as session,
+        served(session, scenes=tmp_path, folder=tmp_path) as (page, _),
+    ):
+        old = session.latest()
+        page.bodies._set_moving(True)
+        page.objects._set_moving(True)
+        page.bodies._add_or_delete(None, "Add")
+        page.objects._create(None, "Sphere")
+        for panel in (page.bodies, page.objects):
+            panel.refresh(old)
+            panel.draw(old)
+            panel.follow(old)
+        assert (page.bodies.chosen, page.objects.chosen) == (session.scene.bodies[-1].name, "sphere")
+        new = session.settle()
+        for panel in (page.bodies, page.objects):
+            panel.refresh(new)
+            panel.draw(new)
+        assert (page.bodies._which.value, page.objects._which.value) == (page.bodies.chosen, page.objects.chosen)
+        assert page.failure is None
+
+
+def test_an_empty_list_of_scenes_says_why(tmp_path) -> None:
+    """Find no scene to open: the page says where it looked, until there is one."""
+    with (
+        Session(device="cpu") as session,
+        served(session, scenes=tmp_path / "scenes", folder=tmp_path) as (page, _),
+    ):
+        assert str(tmp_path / "scenes") in page.scenes._missing.content
+        session.save(tmp_path / "one.toml")
+        page.scenes.refresh(session.settle())
+        assert page.scenes._missing.content == ""
+        assert page.scenes._found.options == (str(tmp_path / "one.toml"),)
+
+
+@pytest.mark.parametrize("aspect", [0.5, 1.0, 16 / 9, 3.0])
+@pytest.mark.parametrize("preset", PRESETS)
+def test_a_camera_sees_all_in_windows_of_any_width(preset, aspect) -> None:
+    """Look at the corners of a box: each is within the field of view, whose height is given, on all sides."""
+    corners = np.array(list(np.ndindex(2, 2, 2))) * [2.0, 1.0, 1.5] + [3.0, 0.5, -1.0]
+    position, target = look(preset, "Y", corners, aspect)
+    backward = (position - target) / np.linalg.norm(position - target)
+    right = np.cross([0.0, 1.0, 0.0], backward)
+    right /= np.linalg.norm(right)
+    x, y, z = np.stack([right, np.cross(backward, right), backward]) @ (corners - position).T
+    slope = np.tan(FIELD_OF_VIEW / 2)
+    assert np.all(np.abs(y) < -slope * z)
+    assert np.all(np.abs(x) < -slope * aspect * z)
 
 
 def test_edges_and_balls_are_drawn_once() -> None:

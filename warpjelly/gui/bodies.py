@@ -68,6 +68,8 @@ class BodiesPanel(Panel):
         self._controls, self._session, self._view, self._folders = controls, session, view, folders
         self._again = again
         self.chosen = ""
+        # The same as soon as it is there: a body that was just added is not yet in a snapshot.
+        self._shown_body = ""
         self._gizmo = gizmo(lambda place, _: session.teleport(self.chosen, to=place.tolist()))
         self._moving = False
         self._which = controls.choice("Body", (), self.choose, hint="What all below is about")
@@ -108,13 +110,17 @@ class BodiesPanel(Panel):
         """Show what the set-up says."""
         scene = snapshot.scene
         names = [str(body.name) for body in scene.bodies]
-        if self.chosen not in names:
-            self.chosen = names[0]
-        body = scene.bodies[names.index(self.chosen)]
-        self._controls.offer(self._which, names, self.chosen)
+        wanted = [str(body.name) for body in self._session.scene.bodies]
+        if (chosen := self.chosen) not in wanted:
+            self.chosen = chosen = wanted[0]
+        self._shown_body = chosen if chosen in names else names[0]
+        body = scene.bodies[names.index(self._shown_body)]
+        self._controls.offer(self._which, names, self._shown_body)
         kinds = tuple(dict.fromkeys(("cube", "voxels", "model", body.type)))
         self._controls.offer(self._kind, kinds, body.type)
-        self._shape.show((body.type,), lambda: self._make_shape(body), snapshot)
+        # Models at hand may be others when a model was uploaded.
+        file = body.file if isinstance(body, ModelBody) else None
+        self._shape.show((body.type, file), lambda: self._make_shape(body), snapshot)
         material = scene.materials[body.material]
         kind = (material.law, material.density is not None)
         self._material.show(kind, lambda: self._make_material(*kind), snapshot)
@@ -124,7 +130,7 @@ class BodiesPanel(Panel):
 
     def follow(self, snapshot: Snapshot) -> None:
         """Show where the body is, and what the colours mean."""
-        if (center := snapshot.centers.get(self.chosen)) is None:
+        if (center := snapshot.centers.get(self._shown_body)) is None:
             return
         self._controls.put(self._place, tuple(np.round(center, 3).tolist()))
         self._legend.content = self._view.legend()
@@ -133,8 +139,8 @@ class BodiesPanel(Panel):
 
     def draw(self, snapshot: Snapshot) -> None:
         """Put the arrows where the body is."""
-        center = snapshot.centers.get(self.chosen) if self._moving else None
-        self._gizmo.show(center, size=0.6 * self._size(snapshot))
+        center = snapshot.centers.get(self._shown_body) if self._moving else None
+        self._gizmo.show(center, size=0.0 if center is None else 0.6 * self._size(snapshot))
 
     def choose(self, name: str) -> None:
         """Let all below be about a body."""
@@ -296,7 +302,7 @@ class BodiesPanel(Panel):
 
     def _of(self, snapshot: Snapshot) -> Any:
         """Return the body as a snapshot's set-up has it."""
-        return next(body for body in snapshot.scene.bodies if body.name == self.chosen)
+        return next(body for body in snapshot.scene.bodies if body.name == self._shown_body)
 
     def _set_pattern(self, pattern: str) -> None:
         if pattern != _DRAWN:
@@ -314,7 +320,7 @@ class BodiesPanel(Panel):
     def _size(self, snapshot: Snapshot) -> float:
         """Return the largest extent of the body as it is, m."""
         shown = zip(snapshot.shapes, snapshot.frames, strict=True)
-        points = np.concatenate([frame.points for shape, frame in shown if shape.body == self.chosen])
+        points = np.concatenate([frame.points for shape, frame in shown if shape.body == self._shown_body])
         return float(np.ptp(points, axis=0).max())
 
 

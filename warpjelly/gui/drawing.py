@@ -1,7 +1,7 @@
 """Bodies as the page draws them: surfaces, springs and particles that move, plainly or in the colours of forces.
 
 A mesh of viser has one colour, and keeps its buffers when its points move. So a surface in the colours of forces is
-some meshes, one for each of a few colours, and triangles go from one to another as forces change.
+some meshes, one for each of a few colours, and faces go from one to another as forces change.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from ..polygons import triangulate
 from ..shapes import PARTICLES, SPRINGS, Shape, ShapeFrame
 
 # How many colours a surface has, and so how many meshes; the legend has as many steps.
-STEPS = 16
+STEPS = 32
 # At most as many lines and balls of a body are drawn, evenly chosen: a browser does not draw more in time.
 MOST_LINES, MOST_BALLS = 20_000, 50_000
 # Jelly where colours do not show forces, sRGB.
@@ -70,7 +70,10 @@ class Surface:
     def __init__(self, scene: Any, path: str, shape: Shape, start: ShapeFrame, grabbed: Grabbed) -> None:
         self._scene, self._path, self._grabbed = scene, path, grabbed
         self._side = "double" if shape.double_sided else "front"
-        self._triangles = triangulate(start.points, shape.counts, shape.corners)[0].astype(np.uint32)
+        triangles, self._faces = triangulate(start.points, shape.counts, shape.corners)
+        self._triangles = triangles.astype(np.uint32)
+        self._counts, self._corners = shape.counts, shape.corners
+        self._face_of_corner = np.repeat(np.arange(len(shape.counts)), shape.counts)
         self._meshes: list[Any] = []
         self._colored = False
 
@@ -86,7 +89,10 @@ class Surface:
         if force_range is None:
             self._meshes[0].vertices = frame.points
             return
-        steps = color_indices(frame.forces, force_range)[self._triangles].sum(axis=1) * STEPS // (3 * COLOR_COUNT)
+        colors = color_indices(frame.forces, force_range)
+        # By faces: where triangles of one face had different colours, borders between colours would be jagged.
+        sums = np.bincount(self._face_of_corner, colors[self._corners], minlength=len(self._counts))
+        steps = (sums * STEPS / (np.maximum(self._counts, 1) * COLOR_COUNT)).astype(int)[self._faces]
         order = np.argsort(steps.astype(np.uint8), kind="stable")
         ends = np.cumsum(np.bincount(steps, minlength=STEPS))
         number = np.zeros(len(frame.points), np.uint32)

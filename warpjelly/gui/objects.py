@@ -43,6 +43,8 @@ class ObjectsPanel(Panel):
     ) -> None:
         self._controls, self._session, self._view, self._again = controls, session, view, again
         self.chosen = _NONE
+        # The same as soon as it is there: an object that was just created is not yet in a snapshot.
+        self._shown_object = _NONE
         self._gizmo = gizmo(self._moved)
         self._moving = False
         controls.buttons("Create", tuple(_TYPES), self._create, hint="Create an object where it is of use")
@@ -56,17 +58,19 @@ class ObjectsPanel(Panel):
     def refresh(self, snapshot: Snapshot) -> None:
         """Show what the set-up says."""
         colliders = {str(collider.name): collider for collider in snapshot.scene.colliders}
-        if self.chosen not in colliders:
-            self.chosen = next(iter(colliders), _NONE)
-        self._controls.offer(self._which, (_NONE, *colliders), self.chosen)
-        collider = colliders.get(self.chosen)
+        wanted = [str(collider.name) for collider in self._session.scene.colliders]
+        if (chosen := self.chosen) not in wanted:
+            self.chosen = chosen = next(iter(wanted), _NONE)
+        self._shown_object = chosen if chosen in colliders else _NONE
+        self._controls.offer(self._which, (_NONE, *colliders), self._shown_object)
+        collider = colliders.get(self._shown_object)
         kind = (collider.type if collider else _NONE,)
         self._form.show(kind, lambda: self._make(collider) if collider else None, snapshot)
 
     def draw(self, snapshot: Snapshot) -> None:
         """Put the arrows where the object is."""
-        found = [collider for collider in snapshot.scene.colliders if collider.name == self.chosen]
-        self._view.chosen_collider = self.chosen if self._moving else None
+        found = [collider for collider in snapshot.scene.colliders if collider.name == self._shown_object]
+        self._view.chosen_collider = self._shown_object if self._moving else None
         if not found or not self._moving:
             self._gizmo.show(None)
             return
@@ -127,6 +131,10 @@ class ObjectsPanel(Panel):
         """Return the object as a set-up has it."""
         return next(collider for collider in scene.colliders if collider.name == self.chosen)
 
+    def _seen(self, snapshot: Snapshot) -> Any:
+        """Return the object that is shown as a snapshot has it."""
+        return next(collider for collider in snapshot.scene.colliders if collider.name == self._shown_object)
+
     # Controls that depend on what the object is.
 
     def _make(self, collider: AnyCollider) -> None:
@@ -136,7 +144,7 @@ class ObjectsPanel(Panel):
             return lambda value: self._change_all({key: value})
 
         def read(key: str) -> Callable[[Snapshot], Any]:
-            return lambda snapshot: getattr(self._of(snapshot.scene), key)
+            return lambda snapshot: getattr(self._seen(snapshot), key)
 
         bind(controls.vector("Centre, m", change("center"), hint="Where it is"), read("center"))
         if isinstance(collider, SphereCollider):
@@ -152,7 +160,7 @@ class ObjectsPanel(Panel):
         else:
             bind(
                 controls.vector("Normal", self._set_normal, hint="Out of the front, perpendicular to it"),
-                lambda snapshot: tuple(np.round(self._of(snapshot.scene).normal, 6).tolist()),
+                lambda snapshot: tuple(np.round(self._seen(snapshot).normal, 6).tolist()),
             )
             self._make_angle("tilt", 180.0, "Between the normal and upwards, degrees")
             self._make_angle("heading", 360.0, "Of the normal around the up axis, degrees")
@@ -161,7 +169,7 @@ class ObjectsPanel(Panel):
 
         def number(label: str, key: str, hint: str, step: float) -> None:
             def used(snapshot: Snapshot) -> float:
-                return float(getattr(snapshot.scene.contact_of(self._of(snapshot.scene)), key))
+                return float(getattr(snapshot.scene.contact_of(self._seen(snapshot)), key))
 
             bind(controls.number(label, change(key), hint=hint, step=step, low=0.0), used)
 
@@ -188,7 +196,7 @@ class ObjectsPanel(Panel):
         self._change_all(changes)
 
     def _angle(self, snapshot: Snapshot, name: str) -> float:
-        tilt, heading = angles_of(self._of(snapshot.scene).normal, snapshot.scene.up)
+        tilt, heading = angles_of(self._seen(snapshot).normal, snapshot.scene.up)
         return round(tilt if name == "tilt" else heading, 1)
 
 

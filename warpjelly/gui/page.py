@@ -54,6 +54,8 @@ class Page:
         """What ended drawing, if something did."""
         server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=_BRAND, control_width="large")
         server.gui.set_panel_label("warpjelly")
+        # Beside the view, so that it hides nothing.
+        server.gui.main_panel.dock_right()
         self._requests = Requests(self._refuse)
         controls = Controls(server.gui, self._requests)
         self.view = View(server, session, self._requests)

@@ -38,7 +38,8 @@ class ScenesPanel(Panel):
         name = session.scene.name
         with controls.folder("Open"):
             self._found = controls.gui.add_dropdown("Scene", ("",), hint=f"In {scenes} and {folder}")
-            controls.button("Open", lambda _: self._open(), hint="Instead of all that is here", icon="folder-open")
+            controls.button("Open", self._open, hint="Instead of all that is here", icon="folder-open")
+            self._missing = controls.gui.add_html("")
         with controls.folder("Save"):
             self._name = controls.text("Name", hint=f"Of a file in {folder}; `warpjelly run` reproduces it", at=name)
             controls.button(
@@ -68,6 +69,8 @@ class ScenesPanel(Panel):
     def _list(self) -> None:
         """List scenes to open, by their paths in the folders."""
         names = tuple(self._files())
+        where = " or ".join(dict.fromkeys(map(str, (self._scenes, self._folder))))
+        self._missing.content = "" if names else note(f"no scene in {where}; save one, or start where some are")
         if names and self._found.options != names:
             self._found.options = names
 
@@ -76,16 +79,28 @@ class ScenesPanel(Panel):
         found = [path for folder in folders if folder.is_dir() for path in sorted(folder.iterdir())]
         return {str(path): path for path in found if path.suffix.lower() in (".toml", SUFFIX) and path.is_file()}
 
-    def _open(self) -> None:
+    def _open(self, client: Any) -> None:
         path = self._files().get(self._found.value)
         if path is None:
             raise InputError(f"no scene to open in {self._scenes} or {self._folder}")
-        self._session.open(path)
-        self._session.settle()
+        # Of a large scene it takes a while.
+        telling = client.add_notification("Opening", str(path), loading=True, with_close_button=False)
+        try:
+            self._session.open(path)
+            self._session.settle()
+        finally:
+            telling.remove()
+        self._name_after_scene()
         self._opened()
+
+    def _name_after_scene(self) -> None:
+        """Suggest to save and record the scene under its name."""
+        name = self._session.scene.name
+        self._name.value, self._run.value = name, f"{name}_run"
 
     def _save(self, client: Any) -> None:
         path = self._folder / f"{self._identifier(self._name.value)}.toml"
+        self._require_new(path)
         self._folder.mkdir(parents=True, exist_ok=True)
         self._session.save(path, force=self._replace.value)
         self._list()
@@ -94,7 +109,14 @@ class ScenesPanel(Panel):
         if self._session.latest().recording is not None:
             self._session.stop_recording()
         else:
-            self._session.record(self._folder / self._identifier(self._run.value), force=self._replace.value)
+            folder = self._folder / self._identifier(self._run.value)
+            self._require_new(folder)
+            self._session.record(folder, force=self._replace.value)
+
+    def _require_new(self, path: Path) -> None:
+        """Refuse what is there already, in words of the page."""
+        if path.exists() and not self._replace.value:
+            raise InputError(f"{path}: there already; choose another name, or tick Replace")
 
     @staticmethod
     def _identifier(name: str) -> str:

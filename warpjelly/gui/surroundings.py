@@ -26,7 +26,7 @@ PRESETS = {
     "Right": (1.0, 0.0, 0.0),
     "Top": (0.0, 1.0, 1e-3),
 }
-# How much farther away than a camera of a run's stage: beside what is seen there are controls.
+# How much farther away than a camera of a run's stage, at least: what is seen may move, and windows may be narrow.
 _ROOM_AROUND = 1.6
 # Vertical field of view of the camera of stages, rad.
 FIELD_OF_VIEW = 2 * math.atan(APERTURE[1] / (2 * FOCAL_LENGTH))
@@ -124,12 +124,19 @@ def in_view(scene: Scene, bodies: np.ndarray) -> np.ndarray:
     return np.concatenate(seen)
 
 
-def look(preset: str, up_axis: str, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where a camera stands that looks from a preset and sees points [count, 3], and what it looks at, m."""
+def look(preset: str, up_axis: str, points: np.ndarray, aspect: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return where a camera stands that looks from a preset, and what it looks at, m.
+
+    Args:
+        preset: of the presets.
+        up_axis: of the scene.
+        points: what the camera sees, [count, 3], m.
+        aspect: width over height of what it sees them in.
+    """
     axes = facing(PRESETS[preset], up_axis)
     position, distance, _ = framing(axes, points)
     target = position - distance * axes[2]
-    return target + _ROOM_AROUND * (position - target), target
+    return target + max(_ROOM_AROUND, APERTURE[0] / APERTURE[1] / aspect) * (position - target), target
 
 
 class Stage:

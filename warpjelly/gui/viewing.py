@@ -12,6 +12,8 @@ from .surroundings import FIELD_OF_VIEW, PRESETS, look
 from .view import View
 
 _BACKGROUND = (238, 240, 244)
+# Width over height of the view in a browser that did not yet say it.
+_ASPECT = 1.1
 
 
 class ViewPanel(Panel):
@@ -58,9 +60,10 @@ class ViewPanel(Panel):
             self._lay_ground()
 
     def aim(self, camera: Any, preset: str = "Perspective") -> None:
-        """Let a camera of viser's look at all bodies."""
+        """Let a camera of viser's look at all bodies; that of browsers to come does not know how wide they are."""
         snapshot = self._session.latest()
-        position, target = look(preset, snapshot.scene.up_axis, self._view.seen(snapshot))
+        aspect = getattr(camera, "aspect", _ASPECT)
+        position, target = look(preset, snapshot.scene.up_axis, self._view.seen(snapshot), aspect)
         camera.position, camera.look_at, camera.fov = position, target, FIELD_OF_VIEW
 
     def _look(self, client: Any, preset: str) -> None:
