@@ -16,7 +16,7 @@ from pxr import Usd
 from runs import samples_of
 from worlds import make_material, make_scene
 
-from warpjelly.errors import EnvironmentFailedError, InputError
+from warpjelly.errors import EnvironmentFailedError, InputError, WarpjellyError
 from warpjelly.gui import session as sessions
 from warpjelly.gui.pace import MOST_BEHIND, WINDOW, Pace
 from warpjelly.gui.session import Session
@@ -206,6 +206,37 @@ def test_a_closed_session_says_so() -> None:
     session.close()
 
 
+def test_what_cannot_be_shown_ends_nothing(start: Callable[..., Session], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answer those who wait, and go on, where something fails again when it is told that it failed."""
+    session = start()
+    settled(session)
+
+    def refuse(_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulator, "shapes", refuse)
+        session.step(1)
+        with pytest.raises(WarpjellyError, match="out of memory"):
+            settled(session)
+        with pytest.raises(MemoryError):
+            session.reset()
+        with pytest.raises(WarpjellyError, match="out of memory"):
+            settled(session)
+    session.step(2)
+    assert settled(session).time == pytest.approx(2e-3)
+
+
+def test_messages_are_repeated_but_for_warnings(start: Callable[..., Session], tmp_path: Path) -> None:
+    """Say each time that something was saved; what each edit warns of anew is said once."""
+    session = start()
+    for _ in range(2):
+        session.save(tmp_path / "scene.toml", force=True)
+        session.tell("mind the gap", "warning")
+    texts = [message.text for message in session.latest().messages][-3:]
+    assert texts == [f"saved as {tmp_path / 'scene.toml'}", "mind the gap", f"saved as {tmp_path / 'scene.toml'}"]
+
+
 # Edits.
 
 
@@ -253,6 +284,20 @@ def test_another_step_keeps_the_time(start: Callable[..., Session]) -> None:
     assert abs(after.time - before.time) <= after.dt / 2 * (1 + 1e-9)
     session.step(1)
     assert settled(session).time == pytest.approx(after.time + after.dt)
+
+
+def test_energies_are_kept_through_edits(start: Callable[..., Session]) -> None:
+    """Lose nothing of the plot where another time step rounds the time down; begin anew with a reset."""
+    session = start(falling_scene(solver={"dt": 1e-3}))
+    for _ in range(7):
+        session.step(1)
+        settled(session)
+    session.change("solver.dt", 5e-3)
+    assert settled(session).time == pytest.approx(5e-3)
+    times = [energies.time for energies in session.history()]
+    assert times == pytest.approx([0.0, 1e-3, 2e-3, 3e-3, 4e-3, 5e-3])
+    session.reset()
+    assert [energies.time for energies in session.history()] == [0.0]
 
 
 def test_a_body_with_other_particles_starts_anew_and_others_go_on(start: Callable[..., Session]) -> None:
@@ -360,6 +405,23 @@ def test_an_edit_that_cannot_be_built_is_taken_back(start: Callable[..., Session
     assert session.latest().messages[-1].level == "error"
     session.change("bodies.cube.particles_per_edge", 4)
     assert settled(session).scene.bodies[0].particles_per_edge == 4
+
+
+def test_what_builds_on_an_edit_that_fails_is_taken_back_too(start: Callable[..., Session]) -> None:
+    """Keep set-up and simulation together where a body was moved after an edit that turns out to be impossible."""
+    session = start(make_scene(bodies=[{**CUBE, "pinned": [{"indices": [26]}]}]))
+    settled(session)
+    before = session.scene
+    free = threading.Event()
+    session._submit(sessions._Command(lambda: free.wait(PATIENCE) and None))
+    session.change("bodies.cube.particles_per_edge", 2)
+    session.teleport("cube", by=[0.0, 1.0, 0.0])
+    free.set()
+    with pytest.raises(InputError, match="no particle 26"):
+        settled(session)
+    assert session.scene == settled(session).scene == before
+    session.step(1)
+    assert settled(session).time > 0.0
 
 
 def test_materials_of_bodies_are_edited_alone(start: Callable[..., Session]) -> None:
@@ -514,6 +576,26 @@ def test_a_teleport_at_time_zero_starts_where_a_file_would(start: Callable[..., 
     assert_same(session, simulator)
 
 
+def test_a_teleport_while_playing_at_time_zero_starts_where_a_file_would(start: Callable[..., Session]) -> None:
+    """Take no step from a place that was displaced and rounded, also where time was let go on before."""
+    session = start(falling_scene(solver={"precision": "float32"}))
+    settled(session)
+    before = session.scene
+    free = threading.Event()
+    session._submit(sessions._Command(lambda: free.wait(PATIENCE) and None))
+    session.play()
+    for _ in range(3):
+        session.teleport("cube", by=[0.1, 0.7, 0.3])
+    free.set()
+    until(session, lambda shown: shown.time > 0.0)
+    session.pause()
+    steps = round(settled(session).time / 1e-3)
+    assert session.scene != before
+    simulator = Simulator(session.scene, device="cpu")
+    simulator.step(steps)
+    assert_same(session, simulator)
+
+
 def test_explicit_places_are_teleported_too(start: Callable[..., Session]) -> None:
     """Move the start of a cube whose particles are each put somewhere, as in worlds."""
     places = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5).tolist()
@@ -624,6 +706,34 @@ def test_what_diverges_is_held_at_the_last_good_moment(start: Callable[..., Sess
 
 
 # What lasts.
+
+
+def test_a_teleport_of_what_diverged_starts_anew(start: Callable[..., Session]) -> None:
+    """Treat it as any other edit."""
+    wild = {"solver": {"dt": 5e-3}, "materials": {"jelly": make_material(stiffness=1e5)}}
+    session = start(falling_scene(**wild))
+    session.step(2000)
+    assert settled(session).diverged
+    session.teleport("cube", by=[0.0, 1.0, 0.0])
+    assert (settled(session).diverged, settled(session).time) == (False, 0.0)
+    assert_same(session, Simulator(session.scene, device="cpu"))
+
+
+def test_another_scene_is_there_when_it_was_opened(start: Callable[..., Session]) -> None:
+    """Show it at once, whatever failed before; keep the one there is if the other cannot be built."""
+    wild = {"solver": {"dt": 5e-3}, "materials": {"jelly": make_material(stiffness=1e5)}}
+    session = start(falling_scene(**wild))
+    session.step(2000)
+    session.play()
+    session.open(SCENES / "jello_cube.toml")
+    shown = session.latest()
+    assert (shown.time, shown.playing, shown.diverged) == (0.0, False, False)
+    assert shown.scene == session.scene != falling_scene(**wild)
+    with pytest.raises(InputError, match="the simulation has diverged"):
+        settled(session)
+    with pytest.raises(InputError, match="no particle 99"):
+        session.take(make_scene(bodies=[{**CUBE, "pinned": [{"indices": [99]}]}]))
+    assert session.scene == session.latest().scene == shown.scene
 
 
 def test_a_saved_scene_reproduces_the_set_up(start: Callable[..., Session], tmp_path: Path) -> None:
@@ -764,6 +874,8 @@ def test_a_recording_refuses_what_it_cannot_show(start: Callable[..., Session], 
         lambda: session.change("output.show", ["particles"]),
         lambda: session.open(SCENES / "jello_cube.toml"),
         session.reset,
+        # Nor the scene itself, which would begin again.
+        lambda: session.take(session.scene),
         lambda: session.record(tmp_path / "other"),
     ):
         with pytest.raises(InputError, match=f"recording to {tmp_path / 'run'}"):
@@ -776,6 +888,27 @@ def test_a_recording_refuses_what_it_cannot_show(start: Callable[..., Session], 
     session.reset()
     session.add_collider("sphere")
     settled(session)
+
+
+def test_samples_are_in_time_whatever_the_step(start: Callable[..., Session], tmp_path: Path) -> None:
+    """Take each sample when it is due, also where dt = "auto" follows the material in the middle of a frame."""
+    session = start(falling_scene(solver={"dt": "auto"}, colliders=[], gravity=[0.0, -10.0, 0.0]))
+    session.record(tmp_path / "run")
+    for stiffness in (30.0, 3000.0, 100.0):
+        before = settled(session).dt
+        session.change("materials.jelly.structural.stiffness", stiffness)
+        dt = settled(session).dt
+        assert dt != before
+        # A frame and a half, as nearly as there are steps.
+        session.step(max(2, round(0.015 / dt)))
+    session.stop_recording()
+    rows = [line.split(",") for line in (tmp_path / "run" / "metrics.csv").read_text().splitlines()]
+    heights = np.array([float(row[rows[0].index("potential")]) for row in rows[1:]])
+    times = np.array([float(row[rows[0].index("time")]) for row in rows[1:]])
+    assert len(times) >= 4
+    fallen = (heights[0] - heights) / (Simulator(falling_scene(), device="cpu").model.particle_mass.numpy().sum() * 10)
+    # Thrown down with 2 m/s; a scheme of first order, off by up to a step, and edits round the time to a step.
+    np.testing.assert_allclose(fallen, 2.0 * times + 5.0 * times**2, atol=0.015)
 
 
 def test_what_diverges_ends_a_recording(start: Callable[..., Session], tmp_path: Path) -> None:
@@ -803,15 +936,16 @@ def test_closing_finishes_a_recording(tmp_path: Path) -> None:
     assert stage_problems(tmp_path / "run") == []
 
 
+@pytest.mark.parametrize("failure", [EnvironmentFailedError, OSError])
 def test_a_recording_that_cannot_be_written_ends(
-    start: Callable[..., Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start: Callable[..., Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: type[Exception]
 ) -> None:
     """Say why, keep what was written, and let the simulation go on."""
     session = start()
     session.record(tmp_path / "run")
 
     def refuse(*_: object) -> None:
-        raise EnvironmentFailedError("run: cannot write the stage: No space left on device")
+        raise failure("run: cannot write the stage: No space left on device")
 
     session.step(30)
     settled(session)
@@ -820,7 +954,7 @@ def test_a_recording_that_cannot_be_written_ends(
     for _ in range(3):
         session.step(10)
         session._live.recording and session._live.recording._background._executor.submit(int).result()
-    with pytest.raises(EnvironmentFailedError, match="No space left on device"):
+    with pytest.raises(WarpjellyError, match="No space left on device"):
         settled(session)
     shown = settled(session)
     assert shown.recording is None
@@ -831,6 +965,9 @@ def test_a_recording_that_cannot_be_written_ends(
     assert (tmp_path / "run" / "stage.usda").exists()
     with pytest.raises(InputError, match="no recording is going"):
         session.stop_recording()
+    monkeypatch.undo()
+    session.record(tmp_path / "run", force=True)
+    assert session.stop_recording()["frames"] == 1
 
 
 KILLED = """
