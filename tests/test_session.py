@@ -18,9 +18,12 @@ from worlds import make_material, make_scene
 
 from warpjelly.errors import EnvironmentFailedError, InputError, WarpjellyError
 from warpjelly.gui import session as sessions
+from warpjelly.gui import uploads
+from warpjelly.gui.limits import LimitSearch
 from warpjelly.gui.pace import MOST_BEHIND, WINDOW, Pace
 from warpjelly.gui.session import Session
-from warpjelly.gui.snapshot import Snapshot
+from warpjelly.gui.snapshot import Limits, Snapshot
+from warpjelly.gui.uploads import Uploads
 from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
 from warpjelly.simulator import Simulator
@@ -225,6 +228,26 @@ def test_what_cannot_be_shown_ends_nothing(start: Callable[..., Session], monkey
             settled(session)
     session.step(2)
     assert settled(session).time == pytest.approx(2e-3)
+
+
+def test_a_failure_holds_time_and_the_first_is_raised(start: Callable[..., Session]) -> None:
+    """Tell of each failure, and raise the first, which the others may come of."""
+    session = start()
+
+    def fail(text: str) -> None:
+        raise InputError(text)
+
+    session.play()
+    free = threading.Event()
+    session._submit(sessions._Command(lambda: free.wait(PATIENCE) and None))
+    for text in ("the first", "the second"):
+        session._submit(sessions._Command(lambda text=text: fail(text)))
+    free.set()
+    with pytest.raises(InputError, match="the first"):
+        settled(session)
+    shown = settled(session)
+    assert not shown.playing
+    assert [message.text for message in shown.messages][-2:] == ["the first", "the second"]
 
 
 def test_messages_are_repeated_but_for_warnings(start: Callable[..., Session], tmp_path: Path) -> None:
@@ -681,6 +704,31 @@ def test_limits_are_found_beside_the_simulation(start: Callable[..., Session]) -
     assert "the time step of 0.005 s is above the largest stable one" in shown.limits.warning
 
 
+def test_limits_of_a_set_up_before_are_not_shown(start: Callable[..., Session]) -> None:
+    """Leave out what a search finds after another one has begun."""
+    session = start()
+    shown = until(session, lambda shown: shown.limits is not None)
+    session._take_limits(LimitSearch(session._live.sim, print, print), Limits(1.0, 1.0, None))
+    assert session.latest().limits == shown.limits
+    assert session.latest().number == shown.number
+
+
+def test_a_search_for_limits_that_fails_is_told_of(
+    start: Callable[..., Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Say so in a line, and let the simulation go on without them."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(Simulator, "step_limits", refuse)
+    session = start()
+    shown = until(session, lambda shown: any("no largest stable step" in each.text for each in shown.messages))
+    assert shown.messages[-1].text.startswith("no largest stable step was found: out of memory")
+    session.step(2)
+    assert settled(session).time > 0.0
+
+
 def test_what_diverges_is_held_at_the_last_good_moment(start: Callable[..., Session]) -> None:
     """Hold time, say why, refuse to go on, and start anew with an edit or a reset."""
     wild = {"solver": {"dt": 5e-3}, "materials": {"jelly": make_material(stiffness=1e5)}}
@@ -717,6 +765,16 @@ def test_a_teleport_of_what_diverged_starts_anew(start: Callable[..., Session]) 
     session.teleport("cube", by=[0.0, 1.0, 0.0])
     assert (settled(session).diverged, settled(session).time) == (False, 0.0)
     assert_same(session, Simulator(session.scene, device="cpu"))
+
+
+def test_a_scene_that_is_opened_is_held(start: Callable[..., Session]) -> None:
+    """Stop playing, at time zero."""
+    session = start()
+    session.play()
+    until(session, lambda shown: shown.time > 0.0)
+    session.take(falling_scene())
+    assert not session.latest().playing
+    assert session.latest().time == 0.0
 
 
 def test_another_scene_is_there_when_it_was_opened(start: Callable[..., Session]) -> None:
@@ -909,6 +967,35 @@ def test_samples_are_in_time_whatever_the_step(start: Callable[..., Session], tm
     fallen = (heights[0] - heights) / (Simulator(falling_scene(), device="cpu").model.particle_mass.numpy().sum() * 10)
     # Thrown down with 2 m/s; a scheme of first order, off by up to a step, and edits round the time to a step.
     np.testing.assert_allclose(fallen, 2.0 * times + 5.0 * times**2, atol=0.015)
+
+
+def test_a_folder_has_one_recording_at_a_time(start: Callable[..., Session], tmp_path: Path) -> None:
+    """Refuse a folder that another session records into, also where what is there may be replaced."""
+    first, second = start(), start()
+    first.record(tmp_path / "run")
+    with pytest.raises(InputError, match="writing"):
+        second.record(tmp_path / "run", force=True)
+    record = first.stop_recording()
+    assert record["resolved_scene"]["frames"] == 1
+    second.record(tmp_path / "run", force=True)
+
+
+def test_uploads_are_limited(start: Callable[..., Session], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refuse what is too large, and take the rest."""
+    monkeypatch.setattr(uploads, "MOST_BYTES", 3)
+    session = start()
+    with pytest.raises(InputError, match=r"a\.obj: 0 MB; at most 0 MB can be sent"):
+        session.upload("a.obj", b"1234")
+    assert session.upload("a.obj", b"123").read_bytes() == b"123"
+
+
+def test_copies_of_uploads_replace_nothing(tmp_path: Path) -> None:
+    """Copy a file beside another one of its name, and once what is the same."""
+    for content, name in ((b"one", "a.obj"), (b"two", "a_2.obj"), (b"one", "a.obj"), (b"two", "a_2.obj")):
+        (tmp_path / "a.obj").write_bytes(content)
+        assert Uploads.copy(tmp_path / "a.obj", tmp_path / "kept") == tmp_path / "kept" / name
+        assert (tmp_path / "kept" / name).read_bytes() == content
+    assert len(list((tmp_path / "kept").iterdir())) == 2
 
 
 def test_what_diverges_ends_a_recording(start: Callable[..., Session], tmp_path: Path) -> None:
