@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -20,13 +21,15 @@ from warpjelly.errors import EnvironmentFailedError, InputError, WarpjellyError
 from warpjelly.gui import session as sessions
 from warpjelly.gui import uploads
 from warpjelly.gui.limits import LimitSearch
+from warpjelly.gui.live import Live
 from warpjelly.gui.pace import MOST_BEHIND, WINDOW, Pace
 from warpjelly.gui.session import Session
+from warpjelly.gui.setup import SetUp
 from warpjelly.gui.snapshot import Limits, Snapshot
 from warpjelly.gui.uploads import Uploads
 from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
-from warpjelly.simulator import Simulator
+from warpjelly.simulator import REST_BLOCK, Simulator
 from warpjelly.stage.stagefiles import open_stage, progress
 from warpjelly.stage.stagewriter import StageWriter
 from warpjelly.stage.validate import stage_problems
@@ -258,6 +261,18 @@ def test_messages_are_repeated_but_for_warnings(start: Callable[..., Session], t
         session.tell("mind the gap", "warning")
     texts = [message.text for message in session.latest().messages][-3:]
     assert texts == [f"saved as {tmp_path / 'scene.toml'}", "mind the gap", f"saved as {tmp_path / 'scene.toml'}"]
+
+
+def test_what_takes_long_is_taken_alone_and_not_made_up_for() -> None:
+    """Take blocks of substeps only while they are short; forget time that is too far behind."""
+    live = Live(SetUp.from_scene(falling_scene()), device="cpu", tell=print, rebuilt=lambda _: None)
+    live.play()
+    for seconds, count in ((1.0, 1), (0.0, 1 + REST_BLOCK)):
+        live._substep_seconds = seconds
+        live.pace.begin(time.perf_counter() - 1e3, 0.0)
+        live.advance()
+        assert live.sim.substep_count == count
+        assert live.pace.seconds_to(time.perf_counter(), live.sim.time) > -1e2
 
 
 # Edits.
@@ -645,6 +660,33 @@ def test_a_body_that_is_lifted_off_a_plane_falls_on_it_again(start: Callable[...
     session.teleport("cube", by=[0.0, -3.0, 0.0])
     session.step(200)
     assert lowest(session) < -3.0
+
+
+def test_a_teleport_forgets_where_a_ball_was_entered(start: Callable[..., Session]) -> None:
+    """Push a body out of a ball on the side where it was put, not where it had come in."""
+    ball = {"name": "ball", "type": "sphere", "radius": 0.5, "normal": "entry"}
+    body = {**CUBE, "position": [0.0, 1.02, 0.0], "velocity": [0.0, -2.0, 0.0]}
+    session = start(make_scene(bodies=[body], colliders=[ball]))
+    session.step(20)
+    before = state(session)
+    bottom = np.argmin(np.linalg.norm(before["x"] - [0.0, 0.48, 0.0], axis=1))
+    assert before["f"][bottom, 1] > 0.1
+    # Its bottom is in the lower half then.
+    session.teleport("cube", by=[0.0, -0.93, 0.0])
+    assert state(session)["f"][bottom, 1] < -0.1
+
+
+def test_what_is_pinned_while_it_moves_stays_there(start: Callable[..., Session]) -> None:
+    """Stop particles where they are pinned, and no others."""
+    session = start(make_scene(bodies=[{**CUBE, "velocity": [1.0, 0.0, 0.0]}]))
+    session.step(5)
+    before = state(session)
+    session.change("bodies.cube.pinned", [{"indices": [26]}])
+    after = state(session)
+    np.testing.assert_array_equal(after["v"][26], 0.0)
+    np.testing.assert_array_equal(after["v"][:26], before["v"][:26])
+    session.step(20)
+    np.testing.assert_array_equal(state(session)["x"][26], before["x"][26])
 
 
 # The hand.
