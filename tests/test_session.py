@@ -554,6 +554,19 @@ def test_a_plane_that_leaps_over_a_body_lets_it_fall(start: Callable[..., Sessio
     assert lowest(session) < -1.0
 
 
+def test_a_plane_meets_what_it_is_moved_through(start: Callable[..., Session]) -> None:
+    """Push up a cube that hovered above a floor, which was moved beyond its lowest particles by one edit."""
+    floor = {"name": "floor", "type": "plane", "normal": [0.0, 1.0, 0.0], "size": [4.0, 4.0]}
+    session = start(make_scene(bodies=[{**CUBE, "position": [0.0, 0.52, 0.0]}], colliders=[floor]))
+    session.step(2)
+    np.testing.assert_allclose(state(session)["f"], 0.0, atol=1e-9)
+    session.change("colliders.floor.center", [0.0, 0.05, 0.0])
+    after = state(session)
+    low = after["x"][:, 1] < 0.05
+    assert low.sum() == 9
+    assert after["f"][low, 1].min() > 1.0
+
+
 def test_a_new_plane_catches_what_touches_it(start: Callable[..., Session]) -> None:
     """Hold a cube by a second floor that appears a little above the first, which goes."""
     session = resting(start)
