@@ -186,6 +186,7 @@ def test_speed_and_energy_are_shown(gui) -> None:
 
     wait(drawn, "lines of energy")
     press(gui.tab, "Pause")
+    wait(lambda: not gui.session.latest().playing, "held")
     gui.session.speed = 1.0
 
 

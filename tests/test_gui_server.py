@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 from runs import CUBE
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from warpjelly import Scene, Simulator, cli
 from warpjelly.errors import EnvironmentFailedError, InputError
@@ -272,3 +274,32 @@ def test_a_port_is_found_where_none_is_given(tmp_path) -> None:
         port = int(first.rpartition(":")[2])
         with pytest.raises(EnvironmentFailedError), served(session, port=port, scenes=tmp_path, folder=tmp_path):
             pass
+
+
+@pytest.mark.parametrize(
+    ("origin", "allowed"),
+    [
+        (None, True),
+        ("http://127.0.0.1:{port}", True),
+        ("http://localhost:{port}", False),
+        ("http://127.0.0.1:1", False),
+        ("https://elsewhere.example", False),
+        ("http://elsewhere.example:{port}", False),
+        ("null", False),
+    ],
+)
+def test_pages_of_other_sites_are_refused(tmp_path, origin, allowed) -> None:
+    """Let only the own page connect: any site that somebody looks at could otherwise change and write things here."""
+    with Session(device="cpu") as session, served(session, scenes=tmp_path, folder=tmp_path) as (_, address):
+        port = address.rpartition(":")[2]
+        options = {"origin": None if origin is None else origin.format(port=port), "subprotocols": ["viser-v0"]}
+        if allowed:
+            with connect(address.replace("http", "ws", 1), **options) as connection:
+                assert connection.subprotocol == "viser-v0"
+        else:
+            with pytest.raises(InvalidStatus, match="HTTP 403"):
+                connect(address.replace("http", "ws", 1), **options)
+        # Nor where a name of another site was given the address of this machine.
+        host = f"elsewhere.example:{port}"
+        with pytest.raises(InvalidStatus, match="HTTP 403"):
+            connect(f"ws://{host}", origin=f"http://{host}", sock=socket.create_connection((LOCAL, int(port))))

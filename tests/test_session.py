@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,14 +17,19 @@ from pxr import Usd
 from runs import samples_of
 from worlds import make_material, make_scene
 
-from warpjelly.errors import EnvironmentFailedError, InputError
+from warpjelly.errors import EnvironmentFailedError, InputError, WarpjellyError
 from warpjelly.gui import session as sessions
+from warpjelly.gui import uploads
+from warpjelly.gui.limits import LimitSearch
+from warpjelly.gui.live import Live
 from warpjelly.gui.pace import MOST_BEHIND, WINDOW, Pace
 from warpjelly.gui.session import Session
-from warpjelly.gui.snapshot import Snapshot
+from warpjelly.gui.setup import SetUp
+from warpjelly.gui.snapshot import Limits, Snapshot
+from warpjelly.gui.uploads import Uploads
 from warpjelly.scene import Scene
 from warpjelly.scenefile import load_scene
-from warpjelly.simulator import Simulator
+from warpjelly.simulator import REST_BLOCK, Simulator
 from warpjelly.stage.stagefiles import open_stage, progress
 from warpjelly.stage.stagewriter import StageWriter
 from warpjelly.stage.validate import stage_problems
@@ -206,6 +212,69 @@ def test_a_closed_session_says_so() -> None:
     session.close()
 
 
+def test_what_cannot_be_shown_ends_nothing(start: Callable[..., Session], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Answer those who wait, and go on, where something fails again when it is told that it failed."""
+    session = start()
+    settled(session)
+
+    def refuse(_: object) -> None:
+        raise MemoryError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Simulator, "shapes", refuse)
+        session.step(1)
+        with pytest.raises(WarpjellyError, match="out of memory"):
+            settled(session)
+        with pytest.raises(MemoryError):
+            session.reset()
+        with pytest.raises(WarpjellyError, match="out of memory"):
+            settled(session)
+    session.step(2)
+    assert settled(session).time == pytest.approx(2e-3)
+
+
+def test_a_failure_holds_time_and_the_first_is_raised(start: Callable[..., Session]) -> None:
+    """Tell of each failure, and raise the first, which the others may come of."""
+    session = start()
+
+    def fail(text: str) -> None:
+        raise InputError(text)
+
+    session.play()
+    free = threading.Event()
+    session._submit(sessions._Command(lambda: free.wait(PATIENCE) and None))
+    for text in ("the first", "the second"):
+        session._submit(sessions._Command(lambda text=text: fail(text)))
+    free.set()
+    with pytest.raises(InputError, match="the first"):
+        settled(session)
+    shown = settled(session)
+    assert not shown.playing
+    assert [message.text for message in shown.messages][-2:] == ["the first", "the second"]
+
+
+def test_messages_are_repeated_but_for_warnings(start: Callable[..., Session], tmp_path: Path) -> None:
+    """Say each time that something was saved; what each edit warns of anew is said once."""
+    session = start()
+    for _ in range(2):
+        session.save(tmp_path / "scene.toml", force=True)
+        session.tell("mind the gap", "warning")
+    texts = [message.text for message in session.latest().messages][-3:]
+    assert texts == [f"saved as {tmp_path / 'scene.toml'}", "mind the gap", f"saved as {tmp_path / 'scene.toml'}"]
+
+
+def test_what_takes_long_is_taken_alone_and_not_made_up_for() -> None:
+    """Take blocks of substeps only while they are short; forget time that is too far behind."""
+    live = Live(SetUp.from_scene(falling_scene()), device="cpu", tell=print, rebuilt=lambda _: None)
+    live.play()
+    for seconds, count in ((1.0, 1), (0.0, 1 + REST_BLOCK)):
+        live._substep_seconds = seconds
+        live.pace.begin(time.perf_counter() - 1e3, 0.0)
+        live.advance()
+        assert live.sim.substep_count == count
+        assert live.pace.seconds_to(time.perf_counter(), live.sim.time) > -1e2
+
+
 # Edits.
 
 
@@ -253,6 +322,20 @@ def test_another_step_keeps_the_time(start: Callable[..., Session]) -> None:
     assert abs(after.time - before.time) <= after.dt / 2 * (1 + 1e-9)
     session.step(1)
     assert settled(session).time == pytest.approx(after.time + after.dt)
+
+
+def test_energies_are_kept_through_edits(start: Callable[..., Session]) -> None:
+    """Lose nothing of the plot where another time step rounds the time down; begin anew with a reset."""
+    session = start(falling_scene(solver={"dt": 1e-3}))
+    for _ in range(7):
+        session.step(1)
+        settled(session)
+    session.change("solver.dt", 5e-3)
+    assert settled(session).time == pytest.approx(5e-3)
+    times = [energies.time for energies in session.history()]
+    assert times == pytest.approx([0.0, 1e-3, 2e-3, 3e-3, 4e-3, 5e-3])
+    session.reset()
+    assert [energies.time for energies in session.history()] == [0.0]
 
 
 def test_a_body_with_other_particles_starts_anew_and_others_go_on(start: Callable[..., Session]) -> None:
@@ -362,6 +445,23 @@ def test_an_edit_that_cannot_be_built_is_taken_back(start: Callable[..., Session
     assert settled(session).scene.bodies[0].particles_per_edge == 4
 
 
+def test_what_builds_on_an_edit_that_fails_is_taken_back_too(start: Callable[..., Session]) -> None:
+    """Keep set-up and simulation together where a body was moved after an edit that turns out to be impossible."""
+    session = start(make_scene(bodies=[{**CUBE, "pinned": [{"indices": [26]}]}]))
+    settled(session)
+    before = session.scene
+    free = threading.Event()
+    session._submit(sessions._Command(lambda: free.wait(PATIENCE) and None))
+    session.change("bodies.cube.particles_per_edge", 2)
+    session.teleport("cube", by=[0.0, 1.0, 0.0])
+    free.set()
+    with pytest.raises(InputError, match="no particle 26"):
+        settled(session)
+    assert session.scene == settled(session).scene == before
+    session.step(1)
+    assert settled(session).time > 0.0
+
+
 def test_materials_of_bodies_are_edited_alone(start: Callable[..., Session]) -> None:
     """Give a body that shares a material one of its own, once, and drop what nothing is made of."""
     session = start(make_scene(bodies=[CUBE, {**CUBE, "name": "other", "position": [3.0, 0.0, 0.0]}]))
@@ -454,6 +554,19 @@ def test_a_plane_that_leaps_over_a_body_lets_it_fall(start: Callable[..., Sessio
     assert lowest(session) < -1.0
 
 
+def test_a_plane_meets_what_it_is_moved_through(start: Callable[..., Session]) -> None:
+    """Push up a cube that hovered above a floor, which was moved beyond its lowest particles by one edit."""
+    floor = {"name": "floor", "type": "plane", "normal": [0.0, 1.0, 0.0], "size": [4.0, 4.0]}
+    session = start(make_scene(bodies=[{**CUBE, "position": [0.0, 0.52, 0.0]}], colliders=[floor]))
+    session.step(2)
+    np.testing.assert_allclose(state(session)["f"], 0.0, atol=1e-9)
+    session.change("colliders.floor.center", [0.0, 0.05, 0.0])
+    after = state(session)
+    low = after["x"][:, 1] < 0.05
+    assert low.sum() == 9
+    assert after["f"][low, 1].min() > 1.0
+
+
 def test_a_new_plane_catches_what_touches_it(start: Callable[..., Session]) -> None:
     """Hold a cube by a second floor that appears a little above the first, which goes."""
     session = resting(start)
@@ -514,6 +627,26 @@ def test_a_teleport_at_time_zero_starts_where_a_file_would(start: Callable[..., 
     assert_same(session, simulator)
 
 
+def test_a_teleport_while_playing_at_time_zero_starts_where_a_file_would(start: Callable[..., Session]) -> None:
+    """Take no step from a place that was displaced and rounded, also where time was let go on before."""
+    session = start(falling_scene(solver={"precision": "float32"}))
+    settled(session)
+    before = session.scene
+    free = threading.Event()
+    session._submit(sessions._Command(lambda: free.wait(PATIENCE) and None))
+    session.play()
+    for _ in range(3):
+        session.teleport("cube", by=[0.1, 0.7, 0.3])
+    free.set()
+    until(session, lambda shown: shown.time > 0.0)
+    session.pause()
+    steps = round(settled(session).time / 1e-3)
+    assert session.scene != before
+    simulator = Simulator(session.scene, device="cpu")
+    simulator.step(steps)
+    assert_same(session, simulator)
+
+
 def test_explicit_places_are_teleported_too(start: Callable[..., Session]) -> None:
     """Move the start of a cube whose particles are each put somewhere, as in worlds."""
     places = (np.indices((2, 2, 2)).reshape(3, -1).T - 0.5).tolist()
@@ -540,6 +673,33 @@ def test_a_body_that_is_lifted_off_a_plane_falls_on_it_again(start: Callable[...
     session.teleport("cube", by=[0.0, -3.0, 0.0])
     session.step(200)
     assert lowest(session) < -3.0
+
+
+def test_a_teleport_forgets_where_a_ball_was_entered(start: Callable[..., Session]) -> None:
+    """Push a body out of a ball on the side where it was put, not where it had come in."""
+    ball = {"name": "ball", "type": "sphere", "radius": 0.5, "normal": "entry"}
+    body = {**CUBE, "position": [0.0, 1.02, 0.0], "velocity": [0.0, -2.0, 0.0]}
+    session = start(make_scene(bodies=[body], colliders=[ball]))
+    session.step(20)
+    before = state(session)
+    bottom = np.argmin(np.linalg.norm(before["x"] - [0.0, 0.48, 0.0], axis=1))
+    assert before["f"][bottom, 1] > 0.1
+    # Its bottom is in the lower half then.
+    session.teleport("cube", by=[0.0, -0.93, 0.0])
+    assert state(session)["f"][bottom, 1] < -0.1
+
+
+def test_what_is_pinned_while_it_moves_stays_there(start: Callable[..., Session]) -> None:
+    """Stop particles where they are pinned, and no others."""
+    session = start(make_scene(bodies=[{**CUBE, "velocity": [1.0, 0.0, 0.0]}]))
+    session.step(5)
+    before = state(session)
+    session.change("bodies.cube.pinned", [{"indices": [26]}])
+    after = state(session)
+    np.testing.assert_array_equal(after["v"][26], 0.0)
+    np.testing.assert_array_equal(after["v"][:26], before["v"][:26])
+    session.step(20)
+    np.testing.assert_array_equal(state(session)["x"][26], before["x"][26])
 
 
 # The hand.
@@ -599,6 +759,31 @@ def test_limits_are_found_beside_the_simulation(start: Callable[..., Session]) -
     assert "the time step of 0.005 s is above the largest stable one" in shown.limits.warning
 
 
+def test_limits_of_a_set_up_before_are_not_shown(start: Callable[..., Session]) -> None:
+    """Leave out what a search finds after another one has begun."""
+    session = start()
+    shown = until(session, lambda shown: shown.limits is not None)
+    session._take_limits(LimitSearch(session._live.sim, print, print), Limits(1.0, 1.0, None))
+    assert session.latest().limits == shown.limits
+    assert session.latest().number == shown.number
+
+
+def test_a_search_for_limits_that_fails_is_told_of(
+    start: Callable[..., Session], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Say so in a line, and let the simulation go on without them."""
+
+    def refuse(*_: object, **__: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(Simulator, "step_limits", refuse)
+    session = start()
+    shown = until(session, lambda shown: any("no largest stable step" in each.text for each in shown.messages))
+    assert shown.messages[-1].text.startswith("no largest stable step was found: out of memory")
+    session.step(2)
+    assert settled(session).time > 0.0
+
+
 def test_what_diverges_is_held_at_the_last_good_moment(start: Callable[..., Session]) -> None:
     """Hold time, say why, refuse to go on, and start anew with an edit or a reset."""
     wild = {"solver": {"dt": 5e-3}, "materials": {"jelly": make_material(stiffness=1e5)}}
@@ -624,6 +809,44 @@ def test_what_diverges_is_held_at_the_last_good_moment(start: Callable[..., Sess
 
 
 # What lasts.
+
+
+def test_a_teleport_of_what_diverged_starts_anew(start: Callable[..., Session]) -> None:
+    """Treat it as any other edit."""
+    wild = {"solver": {"dt": 5e-3}, "materials": {"jelly": make_material(stiffness=1e5)}}
+    session = start(falling_scene(**wild))
+    session.step(2000)
+    assert settled(session).diverged
+    session.teleport("cube", by=[0.0, 1.0, 0.0])
+    assert (settled(session).diverged, settled(session).time) == (False, 0.0)
+    assert_same(session, Simulator(session.scene, device="cpu"))
+
+
+def test_a_scene_that_is_opened_is_held(start: Callable[..., Session]) -> None:
+    """Stop playing, at time zero."""
+    session = start()
+    session.play()
+    until(session, lambda shown: shown.time > 0.0)
+    session.take(falling_scene())
+    assert not session.latest().playing
+    assert session.latest().time == 0.0
+
+
+def test_another_scene_is_there_when_it_was_opened(start: Callable[..., Session]) -> None:
+    """Show it at once, whatever failed before; keep the one there is if the other cannot be built."""
+    wild = {"solver": {"dt": 5e-3}, "materials": {"jelly": make_material(stiffness=1e5)}}
+    session = start(falling_scene(**wild))
+    session.step(2000)
+    session.play()
+    session.open(SCENES / "jello_cube.toml")
+    shown = session.latest()
+    assert (shown.time, shown.playing, shown.diverged) == (0.0, False, False)
+    assert shown.scene == session.scene != falling_scene(**wild)
+    with pytest.raises(InputError, match="the simulation has diverged"):
+        settled(session)
+    with pytest.raises(InputError, match="no particle 99"):
+        session.take(make_scene(bodies=[{**CUBE, "pinned": [{"indices": [99]}]}]))
+    assert session.scene == session.latest().scene == shown.scene
 
 
 def test_a_saved_scene_reproduces_the_set_up(start: Callable[..., Session], tmp_path: Path) -> None:
@@ -764,6 +987,8 @@ def test_a_recording_refuses_what_it_cannot_show(start: Callable[..., Session], 
         lambda: session.change("output.show", ["particles"]),
         lambda: session.open(SCENES / "jello_cube.toml"),
         session.reset,
+        # Nor the scene itself, which would begin again.
+        lambda: session.take(session.scene),
         lambda: session.record(tmp_path / "other"),
     ):
         with pytest.raises(InputError, match=f"recording to {tmp_path / 'run'}"):
@@ -776,6 +1001,56 @@ def test_a_recording_refuses_what_it_cannot_show(start: Callable[..., Session], 
     session.reset()
     session.add_collider("sphere")
     settled(session)
+
+
+def test_samples_are_in_time_whatever_the_step(start: Callable[..., Session], tmp_path: Path) -> None:
+    """Take each sample when it is due, also where dt = "auto" follows the material in the middle of a frame."""
+    session = start(falling_scene(solver={"dt": "auto"}, colliders=[], gravity=[0.0, -10.0, 0.0]))
+    session.record(tmp_path / "run")
+    for stiffness in (30.0, 3000.0, 100.0):
+        before = settled(session).dt
+        session.change("materials.jelly.structural.stiffness", stiffness)
+        dt = settled(session).dt
+        assert dt != before
+        # A frame and a half, as nearly as there are steps.
+        session.step(max(2, round(0.015 / dt)))
+    session.stop_recording()
+    rows = [line.split(",") for line in (tmp_path / "run" / "metrics.csv").read_text().splitlines()]
+    heights = np.array([float(row[rows[0].index("potential")]) for row in rows[1:]])
+    times = np.array([float(row[rows[0].index("time")]) for row in rows[1:]])
+    assert len(times) >= 4
+    fallen = (heights[0] - heights) / (Simulator(falling_scene(), device="cpu").model.particle_mass.numpy().sum() * 10)
+    # Thrown down with 2 m/s; a scheme of first order, off by up to a step, and edits round the time to a step.
+    np.testing.assert_allclose(fallen, 2.0 * times + 5.0 * times**2, atol=0.015)
+
+
+def test_a_folder_has_one_recording_at_a_time(start: Callable[..., Session], tmp_path: Path) -> None:
+    """Refuse a folder that another session records into, also where what is there may be replaced."""
+    first, second = start(), start()
+    first.record(tmp_path / "run")
+    with pytest.raises(InputError, match="writing"):
+        second.record(tmp_path / "run", force=True)
+    record = first.stop_recording()
+    assert record["resolved_scene"]["frames"] == 1
+    second.record(tmp_path / "run", force=True)
+
+
+def test_uploads_are_limited(start: Callable[..., Session], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Refuse what is too large, and take the rest."""
+    monkeypatch.setattr(uploads, "MOST_BYTES", 3)
+    session = start()
+    with pytest.raises(InputError, match=r"a\.obj: 0 MB; at most 0 MB can be sent"):
+        session.upload("a.obj", b"1234")
+    assert session.upload("a.obj", b"123").read_bytes() == b"123"
+
+
+def test_copies_of_uploads_replace_nothing(tmp_path: Path) -> None:
+    """Copy a file beside another one of its name, and once what is the same."""
+    for content, name in ((b"one", "a.obj"), (b"two", "a_2.obj"), (b"one", "a.obj"), (b"two", "a_2.obj")):
+        (tmp_path / "a.obj").write_bytes(content)
+        assert Uploads.copy(tmp_path / "a.obj", tmp_path / "kept") == tmp_path / "kept" / name
+        assert (tmp_path / "kept" / name).read_bytes() == content
+    assert len(list((tmp_path / "kept").iterdir())) == 2
 
 
 def test_what_diverges_ends_a_recording(start: Callable[..., Session], tmp_path: Path) -> None:
@@ -803,15 +1078,16 @@ def test_closing_finishes_a_recording(tmp_path: Path) -> None:
     assert stage_problems(tmp_path / "run") == []
 
 
+@pytest.mark.parametrize("failure", [EnvironmentFailedError, OSError])
 def test_a_recording_that_cannot_be_written_ends(
-    start: Callable[..., Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    start: Callable[..., Session], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, failure: type[Exception]
 ) -> None:
     """Say why, keep what was written, and let the simulation go on."""
     session = start()
     session.record(tmp_path / "run")
 
     def refuse(*_: object) -> None:
-        raise EnvironmentFailedError("run: cannot write the stage: No space left on device")
+        raise failure("run: cannot write the stage: No space left on device")
 
     session.step(30)
     settled(session)
@@ -820,7 +1096,7 @@ def test_a_recording_that_cannot_be_written_ends(
     for _ in range(3):
         session.step(10)
         session._live.recording and session._live.recording._background._executor.submit(int).result()
-    with pytest.raises(EnvironmentFailedError, match="No space left on device"):
+    with pytest.raises(WarpjellyError, match="No space left on device"):
         settled(session)
     shown = settled(session)
     assert shown.recording is None
@@ -831,6 +1107,9 @@ def test_a_recording_that_cannot_be_written_ends(
     assert (tmp_path / "run" / "stage.usda").exists()
     with pytest.raises(InputError, match="no recording is going"):
         session.stop_recording()
+    monkeypatch.undo()
+    session.record(tmp_path / "run", force=True)
+    assert session.stop_recording()["frames"] == 1
 
 
 KILLED = """

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 
+from ..errors import verdict
 from ..simulator import Simulator
 from ..stability import evaluations
 from ..stepping import capture_lock
@@ -24,11 +25,22 @@ class LimitSearch:
     Args:
         sim: whose limits; interactive, so that they may be asked for while it steps.
         found: called with this search and the limits, in that thread.
+        tell: called with a message for people, and its level, where something fails.
+        after: a search that was stopped, to be waited for, so that there is one at a time.
     """
 
-    def __init__(self, sim: Simulator, found: Callable[[LimitSearch, Limits], None]) -> None:
+    def __init__(
+        self,
+        sim: Simulator,
+        found: Callable[[LimitSearch, Limits], None],
+        tell: Callable[[str, str], None],
+        *,
+        after: LimitSearch | None = None,
+    ) -> None:
         self._sim = sim
         self._found = found
+        self._tell = tell
+        self._after = after
         self._stopped = False
         self._thread = threading.Thread(target=self._seek, name="warpjelly limits", daemon=True)
 
@@ -45,14 +57,23 @@ class LimitSearch:
         self._thread.join()
 
     def _seek(self) -> None:
+        if self._after is not None:
+            self._after.join()
+            self._after = None
+        try:
+            self._find()
+        except _UnwantedError:
+            return
+        except Exception as error:
+            self._tell(f"no largest stable step was found: {verdict(error)[0]}", "warning")
+
+    def _find(self) -> None:
         sim = self._sim
         if evaluations(sim.model) * sim.model.spring_count > MOST_EVALUATIONS:
             return
+        self._require_wanted()
         name = sim.scene.solver.integrator
-        try:
-            springs, contact = (sim.step_limits(contacts=on, wanted=self._require_wanted)[name] for on in (False, True))
-        except _UnwantedError:
-            return
+        springs, contact = (sim.step_limits(contacts=on, wanted=self._require_wanted)[name] for on in (False, True))
         with capture_lock:
             limits = Limits(springs, contact, sim.broken_limit())
         if not self._stopped:

@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..errors import DivergedError, InputError, WarpjellyError
+from ..errors import DivergedError, InputError
 from ..grip import Grip
 from ..model import Body
 from ..simulator import REST_BLOCK, Simulator
@@ -100,6 +100,8 @@ class Live:
         began = time.perf_counter()
         if self.pace.seconds_to(began, self.sim.time) > 0.0:
             return
+        # A body may have been moved after time was let go on.
+        self._leave_start()
         count = 1 if self._substep_seconds > LONG_SUBSTEP else REST_BLOCK
         self._go_on(count)
         ended = time.perf_counter()
@@ -113,26 +115,40 @@ class Live:
 
     # The set-up.
 
-    def apply(self, setup: SetUp, *, carry: bool) -> None:
-        """Simulate another set-up.
-
-        Args:
-            setup: what to simulate from now on.
-            carry: go on from the present, unless that has diverged; else from time zero, and hold time there.
+    def edit(self, setup: SetUp) -> None:
+        """Simulate another set-up, from the present on, unless that has diverged; then from time zero.
 
         Raises:
             InputError: it cannot be built; nothing changes then.
         """
-        before, self.setup = self.setup, setup
-        try:
-            self._rebuild(carry=carry)
-        except BaseException:
-            self.setup = before
-            raise
-        self.playing = self.playing and carry
+        self._simulate(setup, carry=True)
 
-    def move_body(self, setup: SetUp, body: str, displacement: np.ndarray, *, at_rest: bool) -> None:
-        """Simulate a set-up in which only the start of a body was moved, and move the body as it is by as much."""
+    def start(self, setup: SetUp) -> None:
+        """Simulate another set-up from time zero, and hold time there.
+
+        Raises:
+            InputError: it cannot be built, and nothing changes then; or a recording is going.
+        """
+        self._require_no_recording()
+        self._simulate(setup, carry=False)
+        self.playing = False
+
+    def move_body(self, before: SetUp, setup: SetUp, body: str, displacement: np.ndarray, *, at_rest: bool) -> None:
+        """Move a body as it is, and its start in the set-up.
+
+        Args:
+            before: the set-up that is simulated.
+            setup: the same with another start of the body.
+            body: its name.
+            displacement: [3], m.
+            at_rest: whether the body stops.
+
+        Raises:
+            InputError: another set-up is simulated, as that one could not be built, and neither can this one.
+        """
+        if self._diverged or self.setup is not before:
+            self.edit(setup)
+            return
         self.setup = setup
         self._revision += 1
         move_body(self.sim, body, displacement, at_rest=at_rest)
@@ -259,17 +275,17 @@ class Live:
     def _go_on(self, substeps: int) -> None:
         """Take some substeps, and the samples of a recording among them."""
         while substeps > 0:
-            count = substeps if self.recording is None else min(substeps, self.recording.missing)
+            missing = substeps if self.recording is None else self.recording.missing(self.sim)
+            count = min(substeps, missing)
             self.sim.step(count)
             substeps -= count
-            if self.recording is not None:
-                if count == self.recording.missing:
-                    self._look_after()
+            if self.recording is not None and count == missing:
+                self._look_after()
                 if self._diverged:
                     return
                 try:
-                    self.recording.advanced(self.sim, count)
-                except WarpjellyError:
+                    self.recording.add_sample(self.sim)
+                except Exception:
                     self._abandon_recording()
                     raise
 
@@ -277,7 +293,8 @@ class Live:
         """Give up what cannot be written; what was written stays."""
         recording, self.recording = self.recording, None
         if recording is not None:
-            with suppress(WarpjellyError):
+            # What is known already.
+            with suppress(Exception):
                 recording.wait()
 
     def _look_after(self) -> None:
@@ -297,6 +314,14 @@ class Live:
     def _require_no_recording(self) -> None:
         if self.recording is not None:
             raise InputError(f"recording to {self.recording.place.folder}; stop the recording first")
+
+    def _simulate(self, setup: SetUp, *, carry: bool) -> None:
+        before, self.setup = self.setup, setup
+        try:
+            self._rebuild(carry=carry)
+        except BaseException:
+            self.setup = before
+            raise
 
     def _rebuild(self, *, carry: bool) -> None:
         old, new = self.sim, self._build()

@@ -9,7 +9,7 @@ from typing import Any
 
 from ..background import Background
 from ..checkpoint import origin_of, scene_keys
-from ..errors import EnvironmentFailedError, InputError, WarpjellyError
+from ..errors import EnvironmentFailedError, InputError
 from ..files import locked
 from ..run import metrics_row, provenance
 from ..rundir import Recorder, open_metrics, refuse_to_replace_run, remove_leftovers, write_record
@@ -89,7 +89,6 @@ class Recording:
         self._began, self._start = time.perf_counter(), sim.time
         # How long it will be is not known yet.
         self._scene = scene.model_copy(update={"frames": MAX_FRAMES, "duration": None})
-        self._sim, self._missing = sim, sim.substeps
         self._held = ExitStack()
         samples = sim.shapes()
         size = sum(array.nbytes for sample in samples for array in vars(sample).values())
@@ -97,26 +96,23 @@ class Recording:
         self._background.submit(self._begin, sim, samples)
         self._add(sim, samples)
 
-    @property
-    def missing(self) -> int:
-        """Substeps up to the next sample."""
-        return self._missing
+    def missing(self, sim: Simulator) -> int:
+        """Return how many substeps there are up to the next sample, which is due at a time, whatever the time step."""
+        due = self._start + self.frames / self._scene.fps
+        return max(1, round((due - sim.time) / sim.dt))
 
-    def advanced(self, sim: Simulator, substeps: int) -> None:
-        """Note that the simulation went on by at most as many substeps as are missing, and take the sample if due.
+    def add_sample(self, sim: Simulator) -> None:
+        """Take a sample of the present.
 
         Raises:
             EnvironmentFailedError: an earlier sample could not be written.
         """
-        self._missing -= substeps
-        if self._missing == 0:
-            self._missing = sim.substeps
-            self._add(sim, sim.shapes())
+        self._add(sim, sim.shapes())
 
     def finish(self, sim: Simulator, *, diverged: bool) -> None:
         """Take no more samples, and bring the stage into its final form; ``wait`` says when that is done."""
         # What could not be written before, wait() says.
-        with suppress(WarpjellyError):
+        with suppress(Exception):
             self._background.submit(self._finish, sim, diverged)
 
     def wait(self) -> dict[str, Any]:

@@ -87,7 +87,6 @@ class ScenesPanel(Panel):
         telling = client.add_notification("Opening", str(path), loading=True, with_close_button=False)
         try:
             self._session.open(path)
-            self._session.settle()
         finally:
             telling.remove()
         self._name_after_scene()

@@ -9,14 +9,18 @@ import time
 import webbrowser
 from collections.abc import Iterator
 from contextlib import contextmanager
+from http import HTTPStatus
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 from ..errors import EnvironmentFailedError, InputError
 from ..scene import Scene
 from ..signals import interruptions
 
 LOCAL = "127.0.0.1"
+# Names of this machine that nobody else can give to one of his.
+_LOCAL_NAMES = (LOCAL, "::1", "localhost")
 # Where a page is looked for first, if no port is asked for.
 USUAL_PORT = 8080
 
@@ -65,7 +69,7 @@ def serve(
     with interruptions() as interrupted, Session(scene, device=device) as session:
         with served(session, host=host, port=port, scenes=scenes, folder=folder) as (page, address):
             print(f"page: {address}  (Ctrl-C ends it)", flush=True)
-            if host != LOCAL:
+            if host not in _LOCAL_NAMES:
                 print(
                     "warning: whoever reaches this address can change the simulation, and write scenes, models and "
                     f"runs into {folder}: there is no password",
@@ -87,7 +91,7 @@ def served(
     viser = require_viser()
     from .page import Page
 
-    with _quiet():
+    with _quiet(), _own_page_only(host):
         server = viser.ViserServer(host=host, port=_free_port(host, port), verbose=False)
     try:
         # If somebody was faster viser took the next one.
@@ -98,7 +102,8 @@ def served(
         server.request_share_url = lambda verbose=True: None
         page = Page(server, session, scenes=scenes, folder=folder)
         try:
-            yield page, f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{chosen}"
+            shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host
+            yield page, f"http://{shown}:{chosen}"
         finally:
             page.close()
     finally:
@@ -123,6 +128,37 @@ def _free_port(host: str, port: int | None) -> int:
 
 def _taken(host: str, port: int) -> str:
     return f"cannot listen at {host}:{port}; choose another --port, or leave it out"
+
+
+@contextmanager
+def _own_page_only(host: str) -> Iterator[None]:
+    """Let servers of viser that are started in the block refuse connections from pages of other sites.
+
+    A browser lets any page connect to this machine, and says which site it is of. That has to be the one it connects
+    to; and where only this machine is listened to, one of its names, as others may be given the same address.
+    """
+    from websockets.asyncio import server
+
+    module: Any = server
+    serve = module.serve
+
+    def serve_own(*arguments: Any, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            # Who is no browser says nothing.
+            if (origin := request.headers.get("Origin")) is not None:
+                site = urlsplit(origin)
+                known = host not in _LOCAL_NAMES or site.hostname in _LOCAL_NAMES
+                if not known or site.netloc != request.headers.get("Host"):
+                    return connection.respond(HTTPStatus.FORBIDDEN, "another site's page may not connect\n")
+            return process_request(connection, request)
+
+        return serve(*arguments, process_request=process, **options)
+
+    module.serve = serve_own
+    try:
+        yield
+    finally:
+        module.serve = serve
 
 
 @contextmanager

@@ -48,7 +48,7 @@ MOST_SPEED = 1000.0
 EDIT, MOVE_HAND = "edit", "move hand"
 # Points of the energy plot, and messages, that are kept.
 HISTORY, MESSAGES = 2000, 100
-# A message that is among so many last ones is not repeated.
+# A warning that is among so many last messages is not repeated: each edit gives it anew.
 REPEATED = 10
 
 
@@ -182,14 +182,14 @@ class Session:
             return self._snapshot
 
     def tell(self, text: str, level: str = "info") -> None:
-        """Add a message for all viewers; not again what is among the last ones.
+        """Add a message for all viewers; a warning that is among the last ones not again.
 
         Args:
             text: one line.
             level: info, warning or error.
         """
         with self._changed:
-            if text in [message.text for message in list(self._messages)[-REPEATED:]]:
+            if level == "warning" and text in [message.text for message in list(self._messages)[-REPEATED:]]:
                 return
             self._message_count += 1
             self._messages.append(Message(self._message_count, level, text))
@@ -224,12 +224,16 @@ class Session:
         """End the simulation and its thread; a recording is finished, files that were sent are removed."""
         atexit.unregister(self.close)
         try:
-            if self._live.recording is not None:
-                self.stop_recording()
+            # Nobody begins another recording in between.
+            with self._editing:
+                try:
+                    if self._live.recording is not None:
+                        self.stop_recording()
+                finally:
+                    with self._changed:
+                        self._closing = True
+                        self._changed.notify_all()
         finally:
-            with self._changed:
-                self._closing = True
-                self._changed.notify_all()
             self._thread.join()
             if self._search is not None:
                 self._search.stop()
@@ -318,7 +322,7 @@ class Session:
         """Take a scene file as the set-up, held at time zero.
 
         Raises:
-            InputError: the file cannot be read, or is no scene that can be built.
+            InputError: the file cannot be read, or is no scene that can be built; or a recording is going.
         """
         self.take(load_scene(path))
 
@@ -326,13 +330,12 @@ class Session:
         """Take a scene as the set-up, held at time zero.
 
         Raises:
-            InputError: the scene cannot be built.
+            InputError: the scene cannot be built; or a recording is going.
         """
         with self._editing:
             with heard(self.tell):
                 setup = SetUp.from_scene(scene)
-            self._require_recordable(setup.scene)
-            self._submit(_Command(lambda: self._live.apply(setup, carry=False)), setup)
+            self._ask(lambda: self._live.start(setup), setup)
 
     # Moving bodies by hand.
 
@@ -362,8 +365,9 @@ class Session:
             entry_named(self._wanted.tables, "bodies", body)
             if by is None:
                 displacement = displacement - self._ask(lambda: self._live.center(body))
-            setup = self._wanted.edited(lambda tables: move_start(tables, body, displacement))
-            move = _Command(lambda: self._live.move_body(setup, body, displacement, at_rest=at_rest))
+            before = self._wanted
+            setup = before.edited(lambda tables: move_start(tables, body, displacement))
+            move = _Command(lambda: self._live.move_body(before, setup, body, displacement, at_rest=at_rest))
             self._submit(move, setup)
 
     def grab(self, body: str, point: Sequence[float]) -> None:
@@ -478,7 +482,7 @@ class Session:
             with heard(self.tell):
                 setup = self._wanted.edited(lambda tables: results.append(edit(tables)))
             self._require_recordable(setup.scene)
-            self._submit(_Command(lambda: self._live.apply(setup, carry=True), EDIT), setup)
+            self._submit(_Command(lambda: self._live.edit(setup), EDIT), setup)
             return results[0]
 
     def _require_recordable(self, scene: Scene) -> None:
@@ -498,8 +502,13 @@ class Session:
             self._commands.append(command)
             self._changed.notify_all()
 
-    def _ask(self, question: Callable[[], Result]) -> Result:
-        """Return the answer to a question that only the thread of the session may answer."""
+    def _ask(self, question: Callable[[], Result], wanted: SetUp | None = None) -> Result:
+        """Return the answer to a question that only the thread of the session may answer, when what came of it shows.
+
+        Args:
+            question: what is asked.
+            wanted: the set-up that comes of it, if it is an edit.
+        """
         answers: list[Result] = []
         failures: list[BaseException] = []
         answered = threading.Event()
@@ -507,12 +516,14 @@ class Session:
         def answer() -> None:
             try:
                 answers.append(question())
+                self._publish()
             except BaseException as error:
+                self._take_back()
                 failures.append(error)
             finally:
                 answered.set()
 
-        self._submit(_Command(answer))
+        self._submit(_Command(answer), wanted)
         answered.wait()
         if failures:
             raise failures[0]
@@ -548,10 +559,10 @@ class Session:
             return
         with self._changed:
             energies, history = snapshot.energies, self._history
-            if history and history[-1].time > energies.time:
-                history.clear()
-            if not history or history[-1].time < energies.time:
-                history.append(energies)
+            # Another time step rounds the time, and a reset takes it back.
+            while history and history[-1].time >= energies.time:
+                history.pop()
+            history.append(energies)
             self._show(snapshot)
 
     def _fail(self, error: BaseException) -> None:
@@ -561,19 +572,29 @@ class Session:
         text, _ = verdict(error)
         with self._changed:
             self._failure = self._failure or (error if isinstance(error, WarpjellyError) else WarpjellyError(text))
-            if not any(command.edits for command in self._commands):
-                self._wanted = self._live.setup
+        self._take_back()
         self._live.pause()
         self.tell(text, "error")
-        self._publish()
+        try:
+            self._publish()
+        except BaseException as another:
+            # The thread goes on, as others may wait for it.
+            log.error("session: nothing newer can be shown: %s", another, exc_info=another)
+
+    def _take_back(self) -> None:
+        """Want what is simulated, after an edit that could not be carried out, unless other edits wait."""
+        with self._changed:
+            if not any(command.edits for command in self._commands):
+                self._wanted = self._live.setup
 
     def _seek_limits(self, sim: Simulator) -> None:
         """Look for the largest stable step of a simulator, and no more for that of the one before."""
-        if self._search is not None:
-            self._search.stop()
+        before = self._search
+        if before is not None:
+            before.stop()
         with self._changed:
             self._limits = None
-            self._search = LimitSearch(sim, self._take_limits)
+            self._search = LimitSearch(sim, self._take_limits, self.tell, after=before)
         self._search.start()
 
     def _take_limits(self, search: LimitSearch, limits: Limits) -> None:
