@@ -407,6 +407,7 @@ def test_commands_keep_their_order_among_edits(start: Callable[..., Session]) ->
         (lambda s: s.drag([float("nan")] * 3), "must be three numbers"),
         (lambda s: s.open("none.toml"), "none.toml: cannot read the scene"),
         (lambda s: s.open(SCENES / "dessert_shot.toml"), "output.over: a run over a shot goes with `warpjelly run`"),
+        (lambda s: s.open(SCENES / "stress_block_10m.toml"), "10,077,696 particles are more than the 2,000,000"),
         (lambda s: s.stop_recording(), "no recording is going"),
         (lambda s: s.save("scene.txt"), "scene.txt: a scene file ends in .toml"),
         (lambda s: s.upload("cat.png", b"x"), "cat.png: not a model file; models are .obj"),

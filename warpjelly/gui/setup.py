@@ -41,6 +41,8 @@ DEFAULT_TABLES: Tables = {
     ],
     "colliders": [{"name": "floor", "type": "plane", "normal": [0.0, 1.0, 0.0], "size": [10.0, 10.0], "damping": 10.0}],
 }
+# Each change builds all bodies anew, which takes seconds for so many.
+MOST_PARTICLES = 2_000_000
 # What a new collider is unless something else is said of it, by type; directions and places are for Y up.
 DEFAULT_COLLIDERS: dict[str, Tables] = {
     "plane": {"center": [0.0, 0.0, 0.0], "normal": [0.0, 1.0, 0.0], "size": [4.0, 4.0]},
@@ -80,7 +82,13 @@ class SetUp:
             raise InputError("output.over: a run over a shot goes with `warpjelly run`, not with an interactive scene")
         # Voxelising launches kernels, which must not get into a graph that another thread captures.
         with capture_lock:
-            return cls(tables, folder, scene, plan_scene(scene, known))
+            plan = plan_scene(scene, known)
+        if plan.particle_count > MOST_PARTICLES:
+            raise InputError(
+                f"{plan.particle_count:,} particles are more than the {MOST_PARTICLES:,} that can be changed while "
+                "they move; lower the resolution or the particles per edge, or use `warpjelly run`"
+            )
+        return cls(tables, folder, scene, plan)
 
     @classmethod
     def from_scene(cls, scene: Scene) -> SetUp:
