@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -167,6 +168,29 @@ def test_plays_and_holds(gui) -> None:
     press(gui.tab, "Reset")
     wait(lambda: gui.session.settle().time == 0.0, "time zero")
     see(gui.tab, lambda seen: middle(seen)[1] < middle(fallen)[1] - 10, "the cube as high as before")
+
+
+def test_a_button_does_what_it_said_when_it_was_pressed(gui) -> None:
+    """Press Pause once more while the first time still waits behind something long: time is held, and not let go."""
+    go(gui.tab, "Play")
+    press(gui.tab, "Play")
+    wait(lambda: gui.session.latest().playing, "playing")
+    gui.tab.get_by_role("button", name="Pause", exact=True).wait_for()
+    over = threading.Event()
+    requests = gui.page._requests
+    requests.ask(None, lambda: over.wait(PATIENCE))
+    wait(lambda: not requests._waiting, "something long")
+    press(gui.tab, "Pause")
+    wait(lambda: len(requests._waiting) == 1, "a request that waits")
+    # The second one comes when the first one is done.
+    requests.ask(None, lambda: wait(lambda: not gui.session.latest().playing, "held"))
+    press(gui.tab, "Pause")
+    wait(lambda: len(requests._waiting) == 3, "another one that waits")
+    over.set()
+    done = threading.Event()
+    requests.ask(None, done.set)
+    assert done.wait(PATIENCE)
+    assert not gui.session.settle().playing
 
 
 def test_speed_and_energy_are_shown(gui) -> None:

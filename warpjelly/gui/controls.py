@@ -99,6 +99,17 @@ class Controls:
         made.on_click(lambda event: self._requests.ask(event.client, lambda: action(event.client)))
         return made
 
+    def toggle(self, label: str, action: Callable[[str], None], *, hint: str, icon: Any, color: Any) -> Any:
+        """Make a button whose label says what it does; its action is given what it said when it was pressed."""
+        made = self.gui.add_button(label, hint=hint, icon=icon, color=color)
+
+        def pressed(event: Any) -> None:
+            meant = made.label
+            self._requests.ask(event.client, lambda: action(meant))
+
+        made.on_click(pressed)
+        return made
+
     def buttons(self, label: str, options: Sequence[str], action: Callable[[Any, str], None], *, hint: str) -> Any:
         """Make buttons in a row; the action is given the client and which one was pressed."""
         made = self.gui.add_button_group(label, tuple(options), hint=hint)

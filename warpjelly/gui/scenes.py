@@ -18,6 +18,7 @@ from .snapshot import Snapshot
 
 # For how long a browser may draw a picture, s.
 _PATIENCE = 30.0
+_RECORD, _STOP = "Record", "Stop recording"
 
 
 class ScenesPanel(Panel):
@@ -47,8 +48,8 @@ class ScenesPanel(Panel):
             )
         with controls.folder("Record"):
             self._run = controls.text("Run", hint=f"Name of a folder in {folder}, with a USD stage", at=f"{name}_run")
-            self._record = controls.button(
-                "Record", self._toggle, hint="Write a USD stage from here on", icon="player-record", color="red"
+            self._record = controls.toggle(
+                _RECORD, self._toggle, hint="Write a USD stage from here on", icon="player-record", color="red"
             )
             self._recorded = controls.gui.add_html("")
         self._replace = controls.gui.add_checkbox("Replace", False, hint="What is there already, of the same name")
@@ -58,7 +59,7 @@ class ScenesPanel(Panel):
     def follow(self, snapshot: Snapshot) -> None:
         """Show how the recording goes."""
         going = snapshot.recording
-        self._record.label = "Record" if going is None else "Stop recording"
+        self._record.label = _RECORD if going is None else _STOP
         self._record.icon = "player-record" if going is None else "player-stop"
         self._recorded.content = "" if going is None else note(f"{going.frames} frames in {going.folder}")
 
@@ -104,8 +105,8 @@ class ScenesPanel(Panel):
         self._session.save(path, force=self._replace.value)
         self._list()
 
-    def _toggle(self, client: Any) -> None:
-        if self._session.latest().recording is not None:
+    def _toggle(self, meant: str) -> None:
+        if meant == _STOP:
             self._session.stop_recording()
         else:
             folder = self._folder / self._identifier(self._run.value)

@@ -14,6 +14,7 @@ from .snapshot import Snapshot
 
 _SPEEDS = {"1/10 of real time": 0.1, "1/4 of real time": 0.25, "1/2 of real time": 0.5, "real time": 1.0}
 _SPEEDS |= {"2 x real time": 2.0, "as fast as it goes": 1000.0}
+_PLAY, _PAUSE = "Play", "Pause"
 _INTEGRATORS = ("explicit_euler", "semi_implicit_euler", "rk2", "rk4")
 # The plot has at most so many points, and is drawn anew after so long, s.
 _POINTS, _PLOT_EVERY = 300, 0.5
@@ -32,8 +33,8 @@ class SimulationPanel(Panel):
     def __init__(self, controls: Controls, session: Session) -> None:
         self._controls, self._session = controls, session
         self._plot_until = 0.0
-        self._play = controls.button(
-            "Play", lambda _: self._toggle(), hint="Let time go on, or hold it", icon="player-play", color="grape"
+        self._play = controls.toggle(
+            _PLAY, self._toggle, hint="Let time go on, or hold it", icon="player-play", color="grape"
         )
         controls.buttons(
             "Time", ("Step", "Reset"), self._jump, hint="Go on by one step of the solver; go back to time zero"
@@ -85,7 +86,7 @@ class SimulationPanel(Panel):
 
     def follow(self, snapshot: Snapshot) -> None:
         """Show how it goes."""
-        self._play.label = "Pause" if snapshot.playing else "Play"
+        self._play.label = _PAUSE if snapshot.playing else _PLAY
         self._play.icon = "player-pause" if snapshot.playing else "player-play"
         speed = min(_SPEEDS, key=lambda name: abs(np.log(_SPEEDS[name] / self._session.speed)))
         self._controls.put(self._speed, speed)
@@ -101,11 +102,11 @@ class SimulationPanel(Panel):
             self._plot_until = now + _PLOT_EVERY
             self._plot.data = self._history()
 
-    def _toggle(self) -> None:
-        if self._session.latest().playing:
-            self._session.pause()
-        else:
+    def _toggle(self, meant: str) -> None:
+        if meant == _PLAY:
             self._session.play()
+        else:
+            self._session.pause()
 
     def _jump(self, client: Any, which: str) -> None:
         if which == "Step":
