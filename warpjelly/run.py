@@ -225,13 +225,7 @@ def _simulate_into(
         "run_dir": str(folder),
         "frames": frames,
         "resumed_from": done,
-        "fps": scene.fps,
-        "particles": sim.model.particle_count,
-        "springs": sim.model.spring_count,
-        "voxels": sim.model.voxel_count,
-        "substeps": sim.substeps,
-        "dt": sim.dt,
-        "precision": scene.solver.precision,
+        **simulated(scene, sim),
         "build_seconds": build_seconds,
         "threads": sim.threads,
         "wall_seconds": time.perf_counter() - began,
@@ -377,6 +371,19 @@ def provenance(scene: Scene, sim: Simulator) -> dict[str, Any]:
         "versions": {"python": platform.python_version()} | {name: version_of(name) for name in packages},
         "machine": platform.machine(),
         "device": sim.device,
+    }
+
+
+def simulated(scene: Scene, sim: Simulator) -> dict[str, Any]:
+    """Return how much is simulated, and how finely, for the record of a run."""
+    return {
+        "fps": scene.fps,
+        "particles": sim.model.particle_count,
+        "springs": sim.model.spring_count,
+        "voxels": sim.model.voxel_count,
+        "substeps": sim.substeps,
+        "dt": sim.dt,
+        "precision": scene.solver.precision,
     }
 
 

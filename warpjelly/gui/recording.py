@@ -11,7 +11,7 @@ from ..background import Background
 from ..checkpoint import origin_of, scene_keys
 from ..errors import EnvironmentFailedError, InputError
 from ..files import locked
-from ..run import metrics_row, provenance
+from ..run import metrics_row, provenance, simulated
 from ..rundir import Recorder, open_metrics, refuse_to_replace_run, remove_leftovers, write_record
 from ..scene import MAX_FRAMES, Scene
 from ..shapes import ShapeFrame
@@ -175,13 +175,7 @@ class Recording:
             "recorded_from": self._start,
             "run_dir": str(folder),
             "frames": frames,
-            "fps": scene.fps,
-            "particles": sim.model.particle_count,
-            "springs": sim.model.spring_count,
-            "voxels": sim.model.voxel_count,
-            "substeps": sim.substeps,
-            "dt": sim.dt,
-            "precision": scene.solver.precision,
+            **simulated(scene, sim),
             "threads": sim.threads,
             "wall_seconds": time.perf_counter() - self._began,
             "diverged": diverged,
