@@ -288,7 +288,13 @@ def test_a_killed_batch_keeps_what_is_finished_and_goes_on(base, tmp_path, start
     cli = start(sweep, "--workers=2")
     cli.wait_for(cli.finished)
     busy = cli.wait_for(lambda: [pid for value in values if (pid := cli.writer_of(f"k{value}", 30)())])
+    # Held until the parent is gone, or they might have finished by then.
+    for pid in busy:
+        os.kill(pid, signal.SIGSTOP)
     cli.process.kill()
+    cli.process.wait()
+    for pid in busy:
+        os.kill(pid, signal.SIGCONT)
     cli.process.communicate()
     until = time.monotonic() + PATIENCE
     while any(map(is_alive, busy)) and time.monotonic() < until:
